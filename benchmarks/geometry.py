@@ -15,9 +15,9 @@ from scipy.spatial import cKDTree
 from benchmarks.runner import Rows, in_turn
 from data_tools.datasets.kitti import kitti_scans
 from data_tools.lidar import SurfelMap, extract_walls, register, segment_ground, voxel_downsample
+from data_tools.lidar.places import PlaceImage, PlaceIndex, PlaceMatch
 from data_tools.lidar.registration import surfels_of
-from data_tools.lidar.scan import clusters_from_above
-from data_tools.lidar.scan_files import load_open3d
+from data_tools.lidar.scan import clusters_from_above, load_open3d
 from pipelines.slam.odometry import LidarOdometry
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
@@ -109,6 +109,10 @@ def geometry(
             lambda case: case.clouds["standing"].cluster_dbscan(0.3, 4),
         ),
         "registration": (ours, theirs),
+        "alignment without a guess": (
+            lambda case: _aligned(case.map_points, case.points),
+            lambda case: _aligned_by_features(case.clouds["points"], case.clouds["map_points"]),
+        ),
     }
     for name, (mine, other) in kinds.items():
         contenders = {"saga-fg": partial(partial, mine), "Open3D": partial(partial, other)}
@@ -121,3 +125,21 @@ def _patches(cloud: Any) -> Any:
     legacy = cloud.to_legacy()
     legacy.estimate_normals()
     return legacy.detect_planar_patches(60, 75, 0.75, 0.0, 0)
+
+
+def _aligned(place: FloatArray, points: FloatArray) -> PlaceMatch:
+    index = PlaceIndex()
+    index.add(0, PlaceImage.of(place))
+    return index.aligned(PlaceImage.of(points), [0])[0]
+
+
+def _aligned_by_features(source: Any, target: Any) -> Any:
+    """FPFH and fast global registration."""
+    module = load_open3d()
+    register_by, search = module.pipelines.registration, module.geometry.KDTreeSearchParamHybrid
+    clouds = [cloud.to_legacy().voxel_down_sample(1.0) for cloud in (source, target)]
+    for cloud in clouds:
+        cloud.estimate_normals(search(2.0, 30))
+    features = [register_by.compute_fpfh_feature(cloud, search(5.0, 100)) for cloud in clouds]
+    option = register_by.FastGlobalRegistrationOption(maximum_correspondence_distance=1.5)
+    return register_by.registration_fgr_based_on_feature_matching(*clouds, *features, option)

@@ -146,7 +146,7 @@ def without(names: tuple[str, ...], code: str, folder: Path) -> subprocess.Compl
 def test_the_tracker_needs_the_numerics_alone_and_what_needs_open3d_says_so(tmp_path):
     run = without((*OPTIONAL, "matplotlib", "typer", "rich"), LIBRARY, tmp_path)
     assert run.returncode == 0, run.stderr
-    code = "from data_tools.lidar.scan_files import load_open3d; load_open3d()"
+    code = "from data_tools.lidar.scan import load_open3d; load_open3d()"
     run = without(OPTIONAL, code, tmp_path)
     assert "open3d cannot be imported" in run.stderr
     assert "pip install open3d" in run.stderr

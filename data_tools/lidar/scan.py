@@ -20,18 +20,27 @@ extends 100 km in every direction.
 
 Clusters are the connected components of the occupied cells of a square grid, each cell with its eight neighbours. Two
 dimensions are enough, because objects on the ground are separate from above.
+
+Open3D tells which points lie in boxes. It is imported on first use, because the import takes half a second and much
+memory. On Linux its extension links `libusb-1.0.so.0` (for depth cameras), which neither its wheel nor a slim system
+carries. The package `libusb-package` carries it; once loaded with global symbols, it satisfies the later link by its
+name.
 """
 
 from __future__ import annotations
 
+import ctypes
+import importlib
+import sys
 from dataclasses import dataclass, replace
+from types import ModuleType
 from typing import Protocol, Self
 
 import gtsam
 import numpy as np
 from scipy.ndimage import label
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, MissingExtraError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.boxes import Boxes
@@ -143,21 +152,20 @@ def inside_boxes(points: FloatArray, boxes: Boxes, margin: float = MARGIN) -> Bo
     """
     known = np.isfinite(boxes.size).all(axis=1) & np.isfinite(boxes.yaw)
     result = np.zeros(len(points), dtype=bool)
+    if not known.any() or not len(points):
+        return result
+    open3d = load_open3d()
+    cloud = open3d.utility.Vector3dVector(np.array(points))
     for row in np.flatnonzero(known).tolist():
-        half = boxes.size[row] / 2 + margin
-        near = np.flatnonzero(_within(points - boxes.position[row], np.full(3, np.linalg.norm(half))))
-        local = (points[near] - boxes.position[row]) @ yaw_transform(yaw=float(boxes.yaw[row]))[:3, :3]
-        result[near[_within(local, half)]] = True
+        turn, size = yaw_transform(yaw=float(boxes.yaw[row]))[:3, :3], boxes.size[row] + 2 * margin
+        box = open3d.geometry.OrientedBoundingBox(boxes.position[row], turn, size)
+        result[box.get_point_indices_within_bounding_box(cloud)] = True
     return result
 
 
 def without_objects(scan: Scan, boxes: Boxes) -> Scan:
     """The scan without points inside boxes, all in one frame."""
     return scan.select(~inside_boxes(scan.points, boxes)) if len(boxes) else scan
-
-
-def _within(offset: FloatArray, half: FloatArray) -> BoolArray:
-    return np.asarray((np.abs(offset) <= half).all(axis=1))
 
 
 _BITS = 21
@@ -235,3 +243,24 @@ def cell_order_statistics(values: FloatArray, cell: IntArray, cells: int, diviso
         ordered = np.sort(cell.astype(np.int64) << bits | by_value) & ((1 << bits) - 1)  # ranks, cell by cell
         result[filled] = values[ranked[ordered[(start + count // divisor)[filled]]]]
     return result
+
+
+def load_open3d() -> ModuleType:
+    """The module `open3d`. Raises `MissingExtraError` with the reason where it cannot be imported."""
+    if "open3d" not in sys.modules:
+        _preload_libusb()
+    try:
+        return importlib.import_module("open3d")
+    except (ImportError, OSError) as error:
+        raise MissingExtraError(f"open3d cannot be imported: {error}; `pip install open3d libusb-package`") from error
+
+
+def _preload_libusb() -> None:
+    if not sys.platform.startswith("linux"):
+        return
+    try:
+        path = importlib.import_module("libusb_package").get_library_path()
+    except ImportError:
+        return  # the system may have its own libusb
+    if path is not None:
+        ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)

@@ -24,24 +24,17 @@ Headers of PCD and PLY are checked against the data after them. Sources: develop
 https://pointclouds.org/documentation/tutorials/pcd_file_format.html; G. Turk, The PLY polygon file format, 1994; LAS
 specification 1.4 R15.
 
-Open3D writes clouds, and reads compressed PCD. It is imported on first use, because the import takes half a second and
-much memory. On Linux its extension links `libusb-1.0.so.0` (for depth cameras), which neither its wheel nor a slim
-system carries. The package `libusb-package` carries it; once loaded with global symbols, it satisfies the later link by
-its name.
+Open3D writes clouds, and reads compressed PCD.
 """
 
 from __future__ import annotations
 
-import ctypes
-import importlib
 import struct
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from io import SEEK_END
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NoReturn
 
 import numpy as np
@@ -51,7 +44,7 @@ from data_tools.files.atomic_files import write_bytes
 from data_tools.files.input_files import open_bytes, read_bytes
 from data_tools.files.isolated_reading import isolated
 from data_tools.files.readers import load_archive, load_array
-from data_tools.lidar.scan import Scan
+from data_tools.lidar.scan import Scan, load_open3d
 from saga_fg.errors import InputError, MissingExtraError, error_context
 from saga_fg.numerics.arrays import BoolArray, FloatArray, checked
 
@@ -452,27 +445,6 @@ _READERS: dict[str, Callable[[Path], Columns]] = {
     ".npz": _arrays,
 }
 SUFFIXES = tuple(_READERS)
-
-
-def load_open3d() -> ModuleType:
-    """The module `open3d`. Raises `MissingExtraError` with the reason where it cannot be imported."""
-    if "open3d" not in sys.modules:
-        _preload_libusb()
-    try:
-        return importlib.import_module("open3d")
-    except (ImportError, OSError) as error:
-        raise MissingExtraError(f"open3d cannot be imported: {error}; `pip install open3d libusb-package`") from error
-
-
-def _preload_libusb() -> None:
-    if not sys.platform.startswith("linux"):
-        return
-    try:
-        path = importlib.import_module("libusb_package").get_library_path()
-    except ImportError:
-        return  # the system may have its own libusb
-    if path is not None:
-        ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
 
 
 def write_cloud(path: str | Path, points: FloatArray, colours: NDArray[np.uint8] | None = None) -> None:

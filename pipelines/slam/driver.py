@@ -13,23 +13,30 @@ places are recognised, and which landmarks a scan shows. Those of a planar laser
 it is closed; then loops are searched for. At the end everything is solved together, and covariances are read off.
 Where the scan leaves a motion open, as along a tunnel, its covariance is wide and the sensors decide.
 Scans between keyframes go along with the keyframe before them, by their odometry.
+
+Moving objects: their points are left out before odometry, landmarks and map see the scan. Objects are tracked along the
+path so far, at the pose where the next scan is expected. One is faster than 1 m/s with the probability
+Phi((|v| - 1 m/s) / sigma), sigma the deviation of its speed, and leaves the scan where that is at least 0.9: by 1.3
+deviations. So new objects, whose velocity nobody knows, stay. Detections in another frame, or of other scans, have
+boxes where the scan shows nothing. Where most of the first ones near the sensor are empty, a warning says so.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 
 import numpy as np
+from scipy.special import ndtr
 
 from data_tools.lidar import Scan, Submap, voxel_downsample
-from data_tools.lidar.scan import without_objects
+from data_tools.lidar.scan import inside_boxes, without_objects
 from data_tools.trajectories import Trajectory
 from pipelines.slam.loop_closures import ClosedSubmaps, SubmapLoops
 from pipelines.slam.odometry import Drive, LidarOdometry, Odometry, OdometryStep, checked_step, moved_pose
-from pipelines.slam.scan_content import MovingObjects
 from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from pipelines.slam.vehicle_sensors import Vehicle, VehicleSensors
 from saga_fg.errors import InputError
@@ -40,8 +47,9 @@ from saga_fg.slam.joint import JointEstimate
 from saga_fg.slam.mapping import AssociatedObservation
 from saga_fg.slam.pose_graph import PoseGraph, PosePriors
 from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph, SubmapSettings
+from saga_fg.tracking import Tracker
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.frame import Detections, EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
+from saga_fg.types.frame import Detections, EgoMeasurements, Frame, GpsFix, ImuSamples, WheelSpeed
 from saga_fg.types.landmark import Landmark, Observation
 
 START = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # of the first pose, which is where the world begins
@@ -136,6 +144,52 @@ class SlamResult:
             (information + information.swapaxes(1, 2)) / 2,
             priors=PosePriors(np.zeros(1, dtype=np.int64), self.drive.poses[0][None], np.linalg.inv(START)[None]),
         )
+
+
+_SPEED = 1.0  # m/s, from which an object moves
+_LIKELY = 0.9  # probability of that, from which its points are left out
+_LEAST_DEVIATION = 0.1  # m/s
+_NEAR, _JUDGED, _FILLED = (4.0, 30.0), 30, 0.6  # m; boxes that are looked at, and the share that is not empty
+_GROUND = np.array([0.0, 0.0, 0.25])  # m, around the lower face of a box, which the ground fills
+_LOG = logging.getLogger(__name__)
+
+
+class MovingObjects:
+    """Tells which objects move; tracker: a new one, at the scanner."""
+
+    def __init__(self, tracker: Tracker) -> None:
+        self._tracker = tracker
+        self._filled: list[bool] = []  # of the first boxes near the sensor
+
+    def check(self, scan: Scan, detections: Detections) -> None:
+        """Warn, once, of detections that do not belong to their scans."""
+        if len(self._filled) >= _JUDGED or not len(scan):
+            return
+        distance = np.linalg.norm(detections.boxes.position[:, :2], axis=1)
+        near = detections.boxes.select((distance > _NEAR[0]) & (distance < _NEAR[1]))
+        raised = replace(near, position=near.position + _GROUND / 2, size=near.size - 2 * np.abs(_GROUND))
+        for row in range(len(near)):
+            self._filled.append(bool(inside_boxes(scan.points, raised.select([row]), 0.0).any()))
+        if len(self._filled) >= _JUDGED and np.mean(self._filled) < _FILLED:
+            _LOG.warning(
+                "detections: expected boxes in the frame of the vehicle, at the times of the scans; of the first %d "
+                "within %.0f m only %d hold points",
+                len(self._filled),
+                _NEAR[1],
+                sum(self._filled),
+            )
+
+    def boxes(self, time: float, detections: Detections, world_T_lidar: FloatArray) -> Boxes:
+        """The detections of moving objects; detections in the scanner's frame, world_T_lidar (4, 4) about."""
+        tracks = self._tracker.step(Frame(time, "lidar", detections, world_T_lidar, "ego"))
+        assignment = self._tracker.assignment
+        _, rows, at = np.intersect1d(assignment.id, tracks.id, return_indices=True)
+        velocity, P = tracks.boxes.velocity[at], tracks.velocity_covariance[at]
+        speed = np.linalg.norm(velocity, axis=1)
+        along = velocity / np.maximum(speed, 1e-9)[:, None]
+        deviation = np.sqrt(np.einsum("ni,nij,nj->n", along, P, along) + _LEAST_DEVIATION**2)
+        moving = ndtr((speed - _SPEED) / deviation) >= _LIKELY
+        return detections.boxes.select(assignment.detection[rows][moving])
 
 
 @dataclass(frozen=True, eq=False)

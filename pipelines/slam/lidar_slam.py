@@ -21,31 +21,69 @@ from typing import Literal
 
 import numpy as np
 
+from data_tools.lidar import extract_curbs, extract_poles, extract_walls, segment_ground, straight_lines
 from data_tools.lidar.recording import scan_context
 from data_tools.lidar.scan import ScanSequence
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
-from pipelines.slam.driver import FrontEnd, Slam, SlamResult
+from pipelines.slam.driver import FrontEnd, MovingObjects, Slam, SlamResult
 from pipelines.slam.loop_closures import LoopSettings, PlaceLoops, SubmapLoops
 from pipelines.slam.odometry import LidarOdometry, Odometry, OdometrySettings, RecordedOdometry
-from pipelines.slam.scan_content import MovingObjects, ScanLandmarkSettings, frames_at, observe_landmarks
 from pipelines.slam.submaps import CloudFormat, world_T_submap
 from pipelines.slam.vehicle_sensors import Vehicle, start_by_fixes
 from pipelines.tracking import Progress
+from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.model.landmarks import LandmarkDetector
+from saga_fg.model.landmarks import LandmarkDetector, LineLandmark, PlaneLandmark, PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryIncrements, OdometryNoise, estimate_jointly
-from saga_fg.slam.joint.record import KEYFRAME_PERIOD
+from saga_fg.slam.joint.record import KEYFRAME_PERIOD, in_ego
 from saga_fg.slam.mapping import LandmarkObservations
 from saga_fg.slam.sensors import sensor_providers
 from saga_fg.slam.submaps import Loops, SubmapSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
 from saga_fg.types.landmark import Observation
+
+WALL = PlaneLandmark(name="wall")
+POLE = PoleLandmark()
+LINE = LineLandmark()
+
+
+@dataclass(frozen=True)
+class ScanLandmarkSettings:
+    """Settings of the detection of landmarks in a scan."""
+
+    walls: int = setting(6, "largest number of walls of a scan; the largest ones are kept")
+    poles: int = setting(12, "largest number of poles of a scan; the nearest ones are kept")
+    lines: int = setting(2, "largest number of curb lines of a scan; those with the most points are kept")
+
+
+def observe_landmarks(
+    points: FloatArray, settings: ScanLandmarkSettings | None = None, detectors: Sequence[LandmarkDetector] = ()
+) -> list[Observation]:
+    """Observe landmarks in points (N, 3) of a scan without skew, m, in the sensor's frame.
+
+    detectors: of further kinds of landmarks
+    """
+    s = settings or ScanLandmarkSettings()
+    ground = segment_ground(points)
+    found: list[Observation] = []
+    walls = extract_walls(points[~ground.is_ground])
+    for wall in walls[: s.walls]:
+        found.append(Observation(WALL, wall.coefficients, wall.covariance, wall.extent))
+    poles = extract_poles(points, ground.height, walls)
+    for pole in sorted(poles, key=lambda pole: float(np.hypot(*pole.foot[:2])))[: s.poles]:
+        extent = np.stack([pole.foot, [*pole.foot[:2], pole.top]])
+        found.append(Observation(POLE, pole.foot, pole.covariance, extent))
+    curbs = extract_curbs(points, ground.height) if s.lines else np.empty((0, 3))
+    for line in straight_lines(curbs, s.lines):
+        found.append(Observation(LINE, line.ends.ravel(), line.covariance, line.ends))
+    return found + [other for detector in detectors for other in detector.observations(points)]
+
 
 OdometrySource = Literal["lidar", "recorded"]
 # slow errors of an odometry that has hardly any; what else it does is in its covariances
@@ -179,6 +217,25 @@ def known_providers(
         if one.landmark in start:
             seen.setdefault(epochs[one.pose], []).append((one.landmark, one.observation))
     return LandmarkObservations(seen, start, settings.robust), Loops(result.loops, epochs)
+
+
+SAME_TIME = 0.01  # s
+
+
+def frames_at(
+    frames: Sequence[Frame], timestamps: FloatArray, lidar_T_ego: FloatArray, tracker: Tracker
+) -> list[Frame]:
+    """The frame at each time, its detections in the frame of the scanner. Raises `InputError` where there is none."""
+    times = np.array([frame.timestamp for frame in frames])
+    found = []
+    for time in timestamps.tolist():
+        nearest = int(np.argmin(np.abs(times - time))) if len(times) else -1
+        if nearest < 0 or abs(times[nearest] - time) > SAME_TIME:
+            raise InputError(f"frames: expected one of detections at {time:.3f} s, the time of a scan; there is none")
+        frame = frames[nearest]
+        detections = in_ego(frame, tracker.sensor(frame.sensor)).transformed(lidar_T_ego)
+        found.append(Frame(time, frame.sensor, detections, np.eye(4), "ego"))
+    return found
 
 
 def path_tracker(config: TrackConfig) -> Tracker:

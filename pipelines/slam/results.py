@@ -63,10 +63,9 @@ from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.slam.driver import SlamResult
 from pipelines.slam.laser_slam import LaserPath
-from pipelines.slam.lidar_slam import LidarSlamSettings
+from pipelines.slam.lidar_slam import LINE, WALL, LidarSlamSettings
 from pipelines.slam.localisation import LocalisedDrive
 from pipelines.slam.odometry import KeyframeClouds, OdometrySettings
-from pipelines.slam.scan_content import LINE, WALL
 from pipelines.slam.submaps import Origin, SlamMap, placed_clouds, write_map
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import in_space, inverse_transform, transform_points, transforms

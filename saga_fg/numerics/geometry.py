@@ -60,7 +60,10 @@ def adjoint(a_T_b: FloatArray) -> FloatArray:
     R, t = a_T_b[..., :3, :3], a_T_b[..., :3, 3]
     result = np.zeros((*a_T_b.shape[:-2], 6, 6))
     result[..., :3, :3] = result[..., 3:, 3:] = R
-    result[..., 3:, :3] = np.cross(t[..., None, :], np.swapaxes(R, -1, -2)).swapaxes(-1, -2)
+    x, y, z = np.moveaxis(t[..., None], -2, 0)  # np.cross takes three times as long for few transforms
+    result[..., 3, :3] = y * R[..., 2, :] - z * R[..., 1, :]
+    result[..., 4, :3] = z * R[..., 0, :] - x * R[..., 2, :]
+    result[..., 5, :3] = x * R[..., 1, :] - y * R[..., 0, :]
     return result
 
 

@@ -6,7 +6,7 @@ has besides: transforms, inertial samples, fixes and the odometry of its wheels.
 
 import numpy as np
 
-from data_tools.lidar.scan_files import load_open3d
+from data_tools.lidar.scan import load_open3d
 from tests.data_tools import mcap_example as example
 
 FOLDERS = ("bin", "pcd", "ply", "las", "npy", "npz")

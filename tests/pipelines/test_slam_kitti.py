@@ -14,11 +14,10 @@ from data_tools.lidar import Scan, Submap, read_scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import Trajectory, read_kitti_poses, read_tum_poses, trajectory_errors
 from pipelines.slam.driver import SlamResult
-from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings, lidar_slam
+from pipelines.slam.lidar_slam import LINE, POLE, LidarSlam, LidarSlamSettings, lidar_slam
 from pipelines.slam.loop_closures import LoopSettings, PlaceLoops
 from pipelines.slam.odometry import OdometrySettings, RecordedOdometry
 from pipelines.slam.results import covered_spans, metrics, write_graph, write_lidar_slam
-from pipelines.slam.scan_content import LINE, POLE
 from pipelines.slam.submaps import placed_clouds
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform

@@ -11,7 +11,7 @@ from benchmarks.scans import SMALL, ScannerSettings, SimulatedScans, StaticWorld
 from data_tools.lidar import Scan, Submap, constant_velocity, voxel_downsample
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.config import load_config
-from pipelines.slam.driver import SlamResult
+from pipelines.slam.driver import MovingObjects, SlamResult
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam, path_tracker
 from pipelines.slam.loop_closures import Agreement, PlaceLoops, deviation
 from pipelines.slam.odometry import (
@@ -23,7 +23,6 @@ from pipelines.slam.odometry import (
     OdometryStep,
 )
 from pipelines.slam.results import metrics
-from pipelines.slam.scan_content import MovingObjects
 from saga_fg import Boxes, Detections, Frame
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray

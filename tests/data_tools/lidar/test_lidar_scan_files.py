@@ -9,7 +9,8 @@ import pytest
 
 from benchmarks.scans import SimulatedScans
 from data_tools.lidar import Scan, read_scan, write_cloud
-from data_tools.lidar.scan_files import SUFFIXES, load_open3d, relative_times
+from data_tools.lidar.scan import load_open3d
+from data_tools.lidar.scan_files import SUFFIXES, relative_times
 from saga_fg.errors import InputError, MissingExtraError
 
 POINTS = np.array([[1.0, 2.0, 3.0], [-4.5, 0.25, -1.75], [10.0, -20.0, 0.5]])

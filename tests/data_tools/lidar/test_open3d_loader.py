@@ -7,13 +7,13 @@ import sys
 
 import pytest
 
-from data_tools.lidar.scan_files import load_open3d
+from data_tools.lidar.scan import load_open3d
 from saga_fg.errors import MissingExtraError
 
 
 def test_open3d_imports_and_computes_without_a_system_libusb() -> None:
     code = (
-        "from data_tools.lidar.scan_files import load_open3d\n"
+        "from data_tools.lidar.scan import load_open3d\n"
         "import numpy as np\n"
         "o3d = load_open3d()\n"
         "assert load_open3d() is o3d\n"
