@@ -47,7 +47,7 @@ def found_at(url: str, folder: Path, size: str = "1300,900") -> Any:
     done = subprocess.run(
         [chromium, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder / 'profile'}",
          f"--window-size={size}", "--virtual-time-budget=60000", "--dump-dom", url],
-        capture_output=True, text=True, check=True, timeout=120,
+        capture_output=True, text=True, check=True, timeout=300,
     )  # fmt: skip
     match = re.search(r'<pre id="found">(.*?)</pre>', done.stdout)
     assert match is not None, done.stdout[-2000:]
