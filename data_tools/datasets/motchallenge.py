@@ -50,6 +50,7 @@ if TYPE_CHECKING:
 
 PEDESTRIAN = "pedestrian"
 TABLE = "tracks.csv"
+LARGEST = 10**6  # frame, id, pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,16 +70,22 @@ class ImageRows:
         )
         text = read_text(path)
         try:
-            rows = np.loadtxt(io.StringIO(text), delimiter=",", ndmin=2) if text.strip() else np.empty((0, 7))
+            rows = (
+                np.loadtxt(io.StringIO(text), delimiter=",", ndmin=2, comments=None)
+                if text.strip()
+                else np.empty((0, 7))
+            )
         except ValueError as error:
             raise InputError(f"{expected}: {error}") from error
         if rows.shape[1] < 7:
             raise InputError(f"{expected}; got {rows.shape[1]}")
-        bad = ~np.isfinite(rows).all(axis=1) | (rows[:, 0] < 1) | (rows[:, :2] % 1 != 0).any(axis=1)
-        bad |= (rows[:, 4:6] <= 0).any(axis=1)
+        bad = ~np.isfinite(rows).all(axis=1) | (rows[:, 0] < 1) | (rows[:, :2] != np.rint(rows[:, :2])).any(axis=1)
+        bad |= (rows[:, 4:6] <= 0).any(axis=1) | (np.abs(rows[:, :6]) > LARGEST).any(axis=1)
         if bad.any():
             row = int(np.argmax(bad))
-            what = "a whole frame from 1 on, a whole id, and a width and height above 0"
+            what = (
+                f"a whole frame from 1 on, a whole id, and a box of a width and height above 0, all within {LARGEST:g}"
+            )
             raise InputError(f"{path}: row {row + 1}: expected {what}, got {rows[row].tolist()}")
         rows = rows[np.argsort(rows[:, 0], kind="stable")]
         xyxy = np.concatenate([rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6]], axis=1)
@@ -142,8 +149,10 @@ def _sequence_facts(path: Path) -> tuple[float, int]:
         raise InputError(
             f"{path}: expected frameRate and seqLength of a [Sequence]: {str(error).splitlines()[0]}"
         ) from error
-    if not (0 < rate < np.inf and length > 0):
-        raise InputError(f"{path}: expected numbers above 0, got frameRate {rate:g} and seqLength {length}")
+    if not (1 / LARGEST <= rate <= LARGEST and 0 < length <= LARGEST):
+        raise InputError(
+            f"{path}: expected numbers from {1 / LARGEST:g} to {LARGEST:g}, got frameRate {rate:g}, seqLength {length}"
+        )
     return rate, length
 
 

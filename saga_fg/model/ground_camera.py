@@ -27,6 +27,7 @@ from saga_fg.types.frame import Detections
 FARTHEST = 1e4  # m; the ground beyond is at the horizon
 _BELOW = 1e4  # px down, where the ground is in every image that shows some
 _LEAST_DEVIATION = 1.0  # px of a foot point
+_LARGEST_CONDITION = 1e15  # of a homography, from which its inverse has no digit left
 
 
 @dataclass(frozen=True)
@@ -59,9 +60,7 @@ class GroundCamera(Settings):
     def ground_H_image(self) -> FloatArray:
         """H (3, 3), of which (0, 0, 1) H (u, v, 1) is above 0 where the pixel shows the ground."""
         if self.homography is not None:
-            H = checked("homography", self.homography, (3, 3))
-            if np.linalg.cond(H) > 1e12:
-                raise InputError("homography: expected a matrix that can be inverted")
+            H = _invertible(checked("homography", self.homography, (3, 3)))
             return np.asarray(H * np.sign(H[2] @ [0.0, _BELOW, 1.0]))
         down, side = (
             np.array([np.cos(self.pitch), np.sin(self.pitch)]),
@@ -70,9 +69,11 @@ class GroundCamera(Settings):
         level = np.array([[0.0, -1.0, 0.0], [-down[1], 0.0, -down[0]], [down[0], 0.0, -down[1]]])
         turned = np.array([[side[0], side[1], 0.0], [-side[1], side[0], 0.0], [0.0, 0.0, 1.0]])
         camera_R_world = turned @ level @ yaw_transform(0.0, 0.0, 0.0, self.yaw)[:3, :3].T
-        t = -camera_R_world @ [self.x, self.y, self.height]
         K = np.array([[self.focal_length, 0, self.centre[0]], [0, self.focal_length, self.centre[1]], [0, 0, 1]])
-        return np.asarray(np.linalg.inv(K @ np.column_stack([camera_R_world[:, :2], t])))
+        with np.errstate(over="ignore", invalid="ignore"):
+            t = -camera_R_world @ [self.x, self.y, self.height]
+            image_H_ground = K @ np.column_stack([camera_R_world[:, :2], t])
+        return np.asarray(np.linalg.inv(_invertible(image_H_ground)))
 
     def places(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Places (n, 2) on the ground at pixels (n, 2), m, NaN beyond the horizon, and their derivatives (n, 2, 2)."""
@@ -110,3 +111,10 @@ class GroundCamera(Settings):
         width, height = boxes.size[:, 1:].T / np.hypot(*J[:, :, 0].T)
         left, low = foot[:, 0] - width / 2, foot[:, 1]
         return np.column_stack([left, low - height, left + width, low])
+
+
+def _invertible(H: FloatArray) -> FloatArray:
+    """A homography (3, 3). Raises `InputError` for one that is singular in double precision."""
+    if not (np.isfinite(H).all() and np.linalg.cond(H) < _LARGEST_CONDITION):
+        raise InputError("expected a camera that sees the ground, by a homography that can be inverted")
+    return H

@@ -26,6 +26,7 @@ from data_tools.datasets.corrections import read_corrections
 from data_tools.datasets.detection_files import read_detections, read_predictions, read_tracks, read_truth
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.datasets.kitti.source import read_scored_sequences
+from data_tools.datasets.motchallenge import MotSequences
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes
 from data_tools.laser import read_carmen
 from data_tools.lidar import Scan, read_scan
@@ -42,6 +43,7 @@ from pipelines.review import read_label_run
 from pipelines.serving import StateKeeper, StreamTracker
 from pipelines.slam.configuration import SlamConfig, load_slam_config
 from pipelines.slam.submaps import SlamMap, read_map, write_map
+from saga_fg.model.ground_camera import GroundCamera
 from saga_fg.types.dataset import Dataset, Scene
 from tests.benchmarks.recordings.ngsim_example import HEADER, crossing, rows
 from tests.data_tools.kitti_example import write_sequence
@@ -56,6 +58,9 @@ PIECES = [
 ]
 NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 
+BOXES = "1,2,300.5,400,40,120,1,1,0.9\n2,2,304.5,400,40,120,1,1,0.9\n2,3,700,500,50,150,1,1,0.9\n"
+SEQUENCE = "[Sequence]\nname=MOT-01\nframeRate=10\nseqLength=3\n"
+CAMERA = "homography: [[0.1, 0, 1], [0, 0.1, 2], [0, 0.001, 1]]\nfocal_length: 900\ncentre: [960, 540]\nheight: 6\n"
 CSV = "timestamp,sensor,label,x,y,length,ego_x,ego_y,ego_yaw\n0,a,car,1,2,3,0,0,0\n1,a,,,,,1,1,1\n"
 NDJSON = '{"timestamp": 0, "x": 1, "y": 2, "label": "car", "yaw": 0.5}\n{"timestamp": 1, "sensor": "b"}\n'
 CORRECTIONS = """{"what": "exists", "at": {"time": 1, "x": 2.5, "y": -3}, "value": false, "who": "a", "when": "2026"}
@@ -180,6 +185,8 @@ def targets(folder: Path) -> dict[str, Target]:
         "log of a sensor": one("gps.csv", GPS, lambda path: read_sensor_log(path, "gps")),
         "laser logs": Target(lasers, lambda: [read_carmen(path) for path in lasers]),
         "map": _map(folder / "map"),
+        "MOTChallenge": _images(folder / "MOT-01"),
+        "camera": one("camera.yaml", CAMERA, lambda path: load_settings(GroundCamera, path)),
         "configuration": one("config.yaml", CONFIG, lambda path: load_settings(TrackConfig, path, config, OTHER_FILES)),
         "configuration of SLAM": one("slam.yaml", SLAM, lambda path: load_settings(SlamConfig, path, slam)),
         "interactions": one("interactions.yaml", INTERACTIONS, load_interactions),
@@ -208,6 +215,15 @@ def _image(path: Path) -> dict[str, Target]:
 
     Image.new("RGB", (40, 30), (200, 100, 50)).save(path)
     return {"image": Target((path,), lambda: thumbnails({"front": [path]}, 32))}
+
+
+def _images(folder: Path) -> Target:
+    """A sequence of MOTChallenge."""
+    for name, content in (("det/det.txt", BOXES), ("gt/gt.txt", BOXES), ("seqinfo.ini", SEQUENCE)):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(content)
+    files = tuple(sorted(folder.rglob("*.*")))
+    return Target(files, lambda: MotSequences(folder, GroundCamera(), truth=True).scene("MOT-01"))
 
 
 def _map(folder: Path) -> Target:

@@ -146,10 +146,17 @@ def test_mistakes_are_one_line(sequences, tmp_path, subtests):
         (detections, "1,-1,a,3,4,5,6\n", f"{detections}: expected rows of at least 7 numbers"),
         (detections, "1,-1,2,3,4,5,.9\n0,-1,2,3,4,5,.9\n", f"{detections}: row 2: expected a whole frame from 1 on"),
         (detections, "1,-1,2,3,-4,5,.9\n", f"{detections}: row 1: expected a whole frame from 1 on"),
+        (detections, "1e9,-1,2,3,4,5,.9\n", f"{detections}: row 1: expected a whole frame from 1 on"),
+        (detections, "# no numbers\n", f"{detections}: expected rows of at least 7 numbers"),
+        (tmp_path / "camera.yaml", "x: 1e300\n", "expected a camera that sees the ground"),
         (facts, "frameRate=3\n", f"{facts}: expected frameRate and seqLength of a [Sequence]"),
-        (facts, "[Sequence]\nframeRate=0\nseqLength=3\n", f"{facts}: expected numbers above 0"),
+        (facts, "[Sequence]\nframeRate=0\nseqLength=3\n", f"{facts}: expected numbers from 1e-06 to 1e+06"),
         (tmp_path / "camera.yaml", "height: -1\n", "height: expected a finite number > 0"),
-        (tmp_path / "camera.yaml", "homography: [[1, 0, 0], [0, 1, 0], [0, 0, 0]]\n", "homography: expected a matrix"),
+        (
+            tmp_path / "camera.yaml",
+            "homography: [[1, 0, 0], [0, 1, 0], [0, 0, 0]]\n",
+            "expected a camera that sees the ground",
+        ),
     ):
         with subtests.test(message):
             before = path.read_text()
