@@ -109,7 +109,7 @@ def points_by_cell(points: FloatArray, size: float) -> tuple[IntArray, IntArray]
     return cells, latest
 
 
-@kernel("i1 f2 f1 f1 b1 i2 i1 i1 f2 f1 f1 b1 i2 i1 i1 f2 f1 f1 i i f f f f f f")
+@kernel("i1 f2 f1 f1 b1 i2 i1 i1 f2 f1 f1 b1 i2 i1 i1 f2 f1 f1 f2 i i f f f f f f")
 def trail_paths(
     lane_of: IntArray,
     lane_points: FloatArray,
@@ -129,6 +129,7 @@ def trail_paths(
     position: FloatArray,
     heading: FloatArray,
     curvature: FloatArray,
+    sharpest: FloatArray,
     steps: int,
     most: int,
     reach: float,
@@ -142,7 +143,8 @@ def trail_paths(
 
     Of n points of lanes, and of those of trails: their tracks `of` (n,), places (n, 2), headings, speeds and whether
     these are known (n,), and the result of `points_by_cell` at 2 * reach; of k tracks: ids (k,), position (k, 2),
-    heading, curvature (k,); most: points compared; length of a step; the rest are the module's scales
+    heading, curvature (k,), sharpest (k, 2), the largest turns, rad, at once and within a step; most: points compared;
+    length of a step; the rest are the module's scales
     """
     of, points, headings = (lane_of, trail_of), (lane_points, trail_points), (lane_headings, trail_headings)
     speeds, timed = (lane_speeds, trail_speeds), (lane_timed, trail_timed)
@@ -198,7 +200,8 @@ def trail_paths(
             for q in range(found):
                 variance += share[q] / scale * (turns[q] - mean) ** 2
             sure = total / (total + prior) / (1 + variance / agreement**2)
-            after = h + own + sure * mean
+            largest = sharpest[t, min(step, 1)]
+            after = h + min(max(own + sure * mean, -largest), largest)
             if step == 0:
                 certainty[t], disagreement[t] = sure, variance
             else:

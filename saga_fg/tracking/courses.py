@@ -24,6 +24,7 @@ LEAVING = 1.0  # m/s, where no earlier traffic tells the path: it may turn, or l
 WIDEST = 0.3  # rad, of a course, however slow the vehicle
 TURNING_OFF = 0.05  # share of vehicles that begin to turn where no earlier traffic tells it
 HARDEST_TURN = 2.0  # m/s^2, across the path: of fast vehicles, comfort limits the turn
+SHARPEST_TURN = 4.0  # m/s^2, across the path, that drivers hardly exceed (Reymond et al., Human Factors 43, 2001)
 TURNING_TIME = 1.0  # s: a path is not known better than by what it turns within this time
 FLOW_TIME = 3.0  # s, in which a vehicle takes on the speed of earlier traffic
 STEPS = 20  # of a path, as far as leaders are looked for
@@ -31,8 +32,11 @@ _ASTRAY = 0.5  # rad between heading and motion, from which the motion is noise
 _TINY = 1e-9  # so that nothing is divided by 0
 
 
-def predicted_paths(state: TrackerState, unseen: BoolArray) -> Paths:
-    """The paths of the `unseen` (n,) vehicles that keep to their courses, of `STEPS` steps, in local positions."""
+def predicted_paths(state: TrackerState, unseen: BoolArray, dt: float) -> Paths:
+    """The paths of the `unseen` (n,) vehicles that keep to their courses, of `STEPS` steps, in local positions.
+
+    dt  s, until they are predicted anew
+    """
     table, headed = state.table, unseen & np.isfinite(state.table.box.yaw)
     rate = np.zeros(len(table))
     able = np.zeros(len(table), dtype=np.bool_)
@@ -48,7 +52,9 @@ def predicted_paths(state: TrackerState, unseen: BoolArray) -> Paths:
     curvature = np.where(speed > MOVING, rate[rows], 0.0) / np.maximum(speed, MOVING)
     box, v, P = table.box, now.velocity, now.P_velocity
     heading = mean_courses(box.yaw[rows], box.yaw_variance[rows], v, P, _ASTRAY, _TINY)
-    found = paths(state.traffic, table.id[rows], now.position + state.origin, heading, curvature, STEPS)
+    lasting = np.maximum(speed, MOVING)
+    sharpest = SHARPEST_TURN / lasting[:, None] * np.column_stack([np.full(len(rows), dt), STEP / lasting])
+    found = paths(state.traffic, table.id[rows], now.position + state.origin, heading, curvature, sharpest, STEPS)
     return unchecked(Paths, **vars(found) | {"row": rows, "position": found.position - state.origin})
 
 

@@ -65,7 +65,7 @@ def _predict_step(state: TrackerState, dt: float, ahead: bool, watched: bool) ->
     table = state.table
     unseen = ahead | (table.last_detected < state.time)
     noise = _predict_stationarity(state, dt)
-    paths = predicted_paths(state, unseen)
+    paths = predicted_paths(state, unseen, dt)
     explained, nodes, lights = state.settings.explained_noise, node_table(state, paths), state.map_nodes
     if watched and lights.beliefs:
         lights.drivers = lights.drivers.later(nodes, state.rules, table.last_detected >= state.time, state.time)

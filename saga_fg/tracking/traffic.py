@@ -13,6 +13,7 @@ With the trails j near its next place, of each the nearest point, d_j m away,
     k_j = exp( -d_j^2 / (2 reach^2) - (h_j - h - u ds)^2 / (2 TURN^2) ),   m, s^2: mean and variance of h_j - h
     h'  = h + c m + (1 - c) u ds,   c = K / (K + PRIOR) / (1 + s^2 / AGREEMENT^2),  K = sum of k_j
 
+A turn is bounded by what a vehicle of its speed can do: at full speed nobody takes the way of those that turn off.
 Where there are no trails, it goes on as it does; at a fork it keeps to the trail that it turns with; where they part
 and it agrees with both, nothing is known of its course, until it is nearer to one of them. The mean of the speeds under
 k_j is the typical speed at each place; lanes tell none.
@@ -304,11 +305,17 @@ _NO_TRAILS = Trails(Passages.empty())
 
 
 def paths(
-    traffic: Traffic, ids: IntArray, position: FloatArray, heading: FloatArray, curvature: FloatArray, steps: int
+    traffic: Traffic,
+    ids: IntArray,
+    position: FloatArray,
+    heading: FloatArray,
+    curvature: FloatArray,
+    sharpest: FloatArray,
+    steps: int,
 ) -> Paths:
     """Predict the paths of n tracks `ids` at `position` (n, 2), world, with a `curvature` (n,) of their own, 1/m.
 
-    Their steps are `STEP` m long, their rows 0 to n - 1.
+    Their steps are `STEP` m long, their rows 0 to n - 1; `sharpest` (n, 2), rad: largest turns at once and in a step.
     """
     reach = max(traffic.settings.reach, _MIN_REACH)
     of_lanes, of_trails = (traffic.lanes, traffic.trails()) if traffic.settings.reach > 0 else (_NO_TRAILS, _NO_TRAILS)
@@ -333,6 +340,7 @@ def paths(
         position=position,
         heading=heading,
         curvature=curvature,
+        sharpest=sharpest,
         steps=steps,
         most=NEAREST,
         reach=reach,

@@ -50,8 +50,9 @@ def arc(length, radius=RADIUS):
     return np.stack([x, radius * (1 - np.cos(angle))], axis=-1), angle
 
 
-def path(trails, position=(-10.0, 0.0), heading=0.0, curvature=0.0, steps=10, track=NOBODY):
-    return paths(trails, track, np.array([position]), np.array([heading]), np.array([curvature]), steps)
+def path(trails, position=(-10.0, 0.0), heading=0.0, curvature=0.0, steps=10, track=NOBODY, sharpest=(np.pi, np.pi)):
+    place, course, bend, turns = (np.array([one]) for one in (position, heading, curvature, sharpest))
+    return paths(trails, track, place, course, bend, turns, steps)
 
 
 def test_a_trail_has_a_point_every_two_metres_and_a_place_once():
@@ -81,6 +82,17 @@ def test_a_path_goes_round_the_bend_of_earlier_traffic_or_beside_it():
     found = path(along(*arc(np.arange(-20, 40, 1.0))), position=(-10.0, 1.0))
     radius = np.hypot(*(found.position[0, 5:] - [0.0, RADIUS]).T)
     assert radius == pytest.approx(np.full(6, RADIUS - 1.0), abs=0.6)
+
+
+def test_who_is_too_fast_for_the_bend_of_those_that_turn_off_leaves_them():
+    trails = along(*arc(np.arange(-20, 40, 1.0)))
+    slow, fast = (path(trails, sharpest=(0.02, turn)) for turn in (0.6, 0.04))
+    assert slow.heading[0] == pytest.approx(path(trails).heading[0])
+    assert np.abs(np.diff(fast.heading[0])).max() < 0.04 + 1e-9
+    assert fast.heading[0, -1] < slow.heading[0, -1] / 2
+    assert fast.weight[0, -1] < 0.1 < slow.weight[0, -1]
+    askew = path(trails, heading=0.1, sharpest=(0.02, 0.6))
+    assert askew.heading[0, 0] == pytest.approx(0.08), "at once it turns by so much"
 
 
 @pytest.mark.parametrize(
