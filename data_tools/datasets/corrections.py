@@ -22,7 +22,7 @@ from pathlib import Path
 
 from data_tools.datasets.detection_files import write_rows
 from data_tools.files.readers import parsed_json, read_lines
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, unknown_name
 from saga_fg.smoothing.corrections import Correction, correction_from
 
 COLUMNS = ("scene", "correction", "what", "timestamp", "x", "y", "who", "when", "problem")
@@ -44,6 +44,13 @@ def corrections_of_lines(lines: Iterable[str], path: Path) -> tuple[Correction, 
             origin = f"{path}: line {number}"
             found.append(correction_from(parsed_json(line, origin), origin))
     return tuple(found)
+
+
+def check_classes(corrections: Iterable[Correction], classes: tuple[str, ...]) -> None:
+    """Raise `InputError` for a correction to a class that labels can't have; classes: () for any."""
+    for one in corrections:
+        if classes and one.label and one.label not in classes:
+            raise InputError(f"{one.origin}: label: {unknown_name('class', one.label, classes)}")
 
 
 Outcomes = Sequence[tuple[str, Correction, str]]

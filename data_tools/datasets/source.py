@@ -272,6 +272,7 @@ class ResultFormat:
     part_option  option that chooses the suffix of the result of one part, "" for that of tracks_example
     all_tracks   what holds the tracks of all parts of a parallel run, for `benchmark`; "" for none
     submission   pattern of the files that the official server takes, "" for none
+    classes      that labels may have, () for any
     """
 
     tracks = "Table of tracks to write: .csv, .ndjson, .jsonl or .parquet (extra [parquet])."
@@ -280,6 +281,7 @@ class ResultFormat:
     part_option = ""
     all_tracks = ""
     submission = ""
+    classes: tuple[str, ...] = ()
 
     def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
         """Write the result of tracking; it appears when all is done."""

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from data_tools.datasets.corrections import read_corrections, read_outcomes
+from data_tools.datasets.corrections import check_classes, read_corrections, read_outcomes
 from data_tools.datasets.given_tracks import GivenTracks, TrackedRecordings, read_given_tracks, tracked_parts
 from data_tools.datasets.source import DatasetSource, input_files
 from pipelines import smoothing
@@ -266,6 +266,7 @@ def _smooth(
     settings = replace(settings, tracking=tracking.with_association(labels.association))
     options.apart(output, *(labels.tracks or ()), *([labels.corrections] if labels.corrections else ()))
     corrections = read_corrections(labels.corrections) if labels.corrections else ()
+    check_classes(corrections, source.written.classes)
     given = read_given_tracks(source, labels.tracks or ())
     settings = smoothing.for_given_tracks(settings, given)
     record = LabelRun.of_command(source, method, settings, labels.tracks, labels.corrections).record

@@ -233,7 +233,7 @@ function makeReview(settings, stage) {
   settings.classes.slice(0, 9).forEach((label, n) => {
     keys[n + 1] = [`${n + 1}`, `it is a ${label}`, () => withBox(row => act({what: "class", at: place(row), label}))];
   });
-  const enter = () => { told = []; changed = null; send(() => store.state(stage.scene().name)); };
+  const enter = () => { told = []; changed = merging = null; send(() => store.state(stage.scene().name)); };
   if (settings.server) window.addEventListener("focus", async () => { if (!waiting && await store.outdated(stage.scene().name)) enter(); });
   showRows();
   const scanned = scene => settings.scanned.includes(scene.name);
@@ -266,7 +266,11 @@ function pageStore(name) {  // in the browser, until they are saved
     all: read, count: () => read().length,
     state: async scene => answer(scene),
     correct: async record => { write([...read(), record]); return answer(record.scene); },
-    undo: async scene => { write(read().toSpliced(read().findLastIndex(one => one.scene === scene), 1)); return answer(scene); },
+    undo: async scene => {  // another window may have taken it back
+      const all = read(), last = all.findLastIndex(one => one.scene === scene);
+      if (last >= 0) write(all.toSpliced(last, 1));
+      return answer(scene);
+    },
   };
 }
 

@@ -107,7 +107,10 @@ class _Handler(BaseHTTPRequestHandler):
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
         if host not in hosts or origin not in (None, f"http://{host}"):
             raise _RefusedError(HTTPStatus.FORBIDDEN, "expected a request by 127.0.0.1 or localhost, from its own page")
-        url, session = urlsplit(self.path), self.server.session
+        try:
+            url, session = urlsplit(self.path), self.server.session
+        except ValueError as error:  # an IPv6 address without its bracket
+            raise _RefusedError(HTTPStatus.BAD_REQUEST, f"expected an address: {error}") from error
         _, token, name, *deeper = f"{url.path}//".split("/")
         if not hmac.compare_digest(token.encode(), self.server.token.encode()):
             raise _RefusedError(HTTPStatus.FORBIDDEN, "expected the address that saga-fg review printed")
@@ -133,7 +136,7 @@ class _Handler(BaseHTTPRequestHandler):
         length = self.headers.get("Content-Length", "")
         if not (length.isascii() and length.isdigit()):
             raise _RefusedError(HTTPStatus.LENGTH_REQUIRED, "expected Content-Length")
-        if int(length[:12]) > LARGEST:
+        if len(length) > len(str(LARGEST)) or int(length) > LARGEST:
             raise _RefusedError(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"expected a request of at most {LARGEST} bytes")
         if self.headers.get_content_type() != "application/json":
             raise _RefusedError(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "expected Content-Type: application/json")

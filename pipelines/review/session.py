@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.corrections import corrections_of_lines
+from data_tools.datasets.corrections import check_classes, corrections_of_lines
 from data_tools.datasets.detection_files import read_tracks
 from data_tools.datasets.results import SceneResult, scene_result
 from data_tools.files.atomic_files import write_text
@@ -74,6 +74,7 @@ class ReviewSession:
         shown = [_shown(found.scene, found.found, found.coasting, run) for found in _labels(folder, scenes)]
         self._shown = {each.scene.name: each for each in with_surroundings(source, shown, images)}
         self._scans = source.surroundings({name: each.scene for name, each in self._shown.items()}).scans()
+        self._classes = source.written.classes
         self._title = f"Review of {folder.name}: {source}"
         corrections_of_lines(self._lines(), file)
 
@@ -106,6 +107,7 @@ class ReviewSession:
         """
         with self._lock:
             lines, one = self._lines(version), correction_from(record, "correction")
+            check_classes([one], self._classes)
             lines.append(json.dumps(record, allow_nan=False))
             answer = self._answer(one.scene, lines)
             if problem := answer["corrections"][-1]["problem"]:
@@ -217,6 +219,10 @@ def _labels(folder: Path, scenes: Mapping[str, Scene]) -> Iterator[SceneResult]:
     if not tables:
         raise InputError(f"{folder}: expected the table labels.csv, or tables of scenes in labels/, there are none")
     parts = [(table, read_tracks(table, labels=True)) for table in tables]
+    for table, rows in parts:
+        if others := sorted({*rows.scene.tolist()} - {*scenes}):
+            unknown = unknown_name("scene", others[0], tuple(scenes))
+            raise InputError(f"{table}: {unknown}; these are another run's labels")
     return (
         scene_result(scene, rows, path) for name, scene in scenes.items() for path, rows in parts if name in rows.scene
     )

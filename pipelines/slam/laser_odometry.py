@@ -250,11 +250,8 @@ class LaserOdometry:
     def __init__(self, scale: WheelScale | None = None) -> None:
         self.scale, self.keyframes = scale or WheelScale(), list[Keyframe]()
         self.wheels: FloatArray = np.eye(3)
-        self._at, self._last, self._at_keyframe = (
-            np.eye(3),
-            np.eye(3),
-            np.eye(3),
-        )  # the scan registered last, its wheels
+        self._at = self._last = np.eye(3)  # the scan registered last, and its wheels
+        self._at_keyframe = np.eye(3)  # the wheels at the last keyframe
         self._map: LineMap | None = None
         self._grid: ScoreGrid | None = None
         self._since = 0  # scans since the last keyframe

@@ -59,10 +59,9 @@ from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph
 
 
 def deviation(T: FloatArray) -> FloatArray:
-    """Translation, m, and rotation, rad, (2,) of a transform (3, 3) or (4, 4)."""
-    d = len(T) - 1
-    turned = float(np.linalg.norm(T[:d, :d] - np.eye(d))) / (2 * np.sqrt(2))  # sin of half the angle
-    return np.array([float(np.linalg.norm(T[:d, d])), 2 * np.arcsin(min(turned, 1.0))])
+    """Translation, m, and rotation, rad, (2,) of a transform (4, 4)."""
+    turned = float(np.linalg.norm(T[:3, :3] - np.eye(3))) / (2 * np.sqrt(2))  # sin of half the angle
+    return np.array([float(np.linalg.norm(T[:3, 3])), 2 * np.arcsin(min(turned, 1.0))])
 
 
 @dataclass(eq=False)

@@ -95,6 +95,9 @@ class _Edits:
             other = self._object_at(one.other, now)
             if other < 0:
                 return False
+            if one.value and other != id_ and (apart := self._apart(id_, other)):
+                self.outcome[number] = f"both are seen at the same time, {apart:.1f} m apart: they are two objects"
+                return True
             self._say(("same", *sorted({id_, other})), number, one)
             if one.value and other != id_:
                 self._join(id_, other)
@@ -180,6 +183,16 @@ class _Edits:
         self.changed.add(id_)
         return id_
 
+    def _apart(self, a: int, b: int) -> float:
+        """Median distance of two objects when both are detected, m; 0 where it is within their length or `REACH`."""
+        boxes, moment = self._evidence.boxes, self._evidence.moment
+        rows = [np.flatnonzero(self._object_of == id_) for id_ in (a, b)]
+        _, first, second = np.intersect1d(moment[rows[0]], moment[rows[1]], return_indices=True)
+        distance = np.linalg.norm(boxes.position[rows[0][first], :2] - boxes.position[rows[1][second], :2], axis=1)
+        apart = float(np.median(distance)) if len(distance) else 0.0
+        longest = np.fmax.reduce(boxes.size[np.concatenate(rows), 0], initial=REACH)
+        return apart if apart > longest else 0.0
+
     def _join(self, a: int, b: int) -> None:
         """Make two objects one, which keeps the name of the first."""
         self._object_of[self._object_of == b] = a
@@ -202,6 +215,7 @@ class _Edits:
         jump = np.hypot(*(moved - states.mean[at[:-1], 2:] * gap[:, None]).T)
         inside = (time[1:] > begin) & (time[:-1] < end)
         if not inside.any():
+            self.outcome[number] = "no step between two detections lies between the two times"
             return
         later = rows[int(np.argmax(np.where(inside, jump + gap, -1.0))) + 1 :]
         new = NEW_ID + number

@@ -30,6 +30,7 @@ from saga_fg.types.frame import LATEST
 
 What = Literal["exists", "class", "same", "box", "standing", "size"]
 SIZE = ("length", "width", "height")
+LEAST = 1e-4  # m and rad, of sizes and deviations
 DEVIATIONS = {"position": 0.1, "height": 0.1, "yaw": 0.05, "size": 0.05}
 """Standard deviations of a person's box where it gives none: m, m, rad, m."""
 
@@ -197,8 +198,8 @@ def _text(record: Mapping[str, Any], name: str, origin: str) -> str:
 def _number(record: Mapping[str, Any], name: str, origin: str, largest: float, positive: bool = False) -> float:
     value = record.get(name)
     usable = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= largest
-    if not usable or (positive and not value > 0):  # type: ignore[operator]
-        kind = "a number above 0" if positive else "a number"
+    if not usable or (positive and not value >= LEAST):  # type: ignore[operator]
+        kind = f"a number from {LEAST:g} on" if positive else "a number"
         raise InputError(f"{origin}: {name}: expected {kind}, of at most {largest:g}, got {value!r:.40}")
     return float(value)  # type: ignore[arg-type]
 

@@ -181,6 +181,10 @@ def test_a_page_from_disk_collects_corrections_and_offers_them_as_a_file(labels,
   const [x, y] = centre();
   await pull([x, y], [x + 40, y]);
   await press("x"); await press("u");
+  const key = Object.keys(localStorage).find(each => each.startsWith("saga-fg review")) ?? Object.keys(MEMORY)[0];
+  const mine = remembered(key), others = mine.map(each => ({...each, scene: "b"}));
+  remember(key, others); await press("u"); found.others = remembered(key).length;  // another window took them back
+  remember(key, mine);
   [...document.querySelectorAll("#review button")].find(each => each.textContent === "Save corrections").click();
   found.saved = await saved.text();
   found.again = said();
@@ -190,6 +194,7 @@ def test_a_page_from_disk_collects_corrections_and_offers_them_as_a_file(labels,
     assert found["faults"] == []
     assert found["listed"] > 0
     assert found["said"].startswith("1 correction in this page")
+    assert found["others"] == 2
     assert found["again"] == "2 corrections saved as mine.jsonl"
     (tmp_path / "mine.jsonl").write_text(found["saved"])
     table = labels.parent / "two.csv"

@@ -20,7 +20,7 @@ from data_tools.datasets.nuscenes.results import (
     read_tracking_results,
     write_tracking_results,
 )
-from data_tools.datasets.nuscenes.tables import read_annotations, split_scenes
+from data_tools.datasets.nuscenes.tables import CATEGORY_OF_CLASS, read_annotations, split_scenes
 from data_tools.datasets.nuscenes.writer import merge_label_parts, write_label_part, write_nuscenes_labels
 from data_tools.datasets.results import Results, SceneResult
 from data_tools.datasets.source import (
@@ -187,6 +187,7 @@ class NuScenesFormat(ResultFormat):
     tracks_example = "tracks.json"
     merged = ("tracks.json", "tracking.json")
     all_tracks = submission = "tracks.json"
+    classes = tuple(CATEGORY_OF_CLASS)
 
     def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
         assert isinstance(dataset, NuScenes | NuScenesPart)

@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
-from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 from scipy.stats import chi2
 
 from factors import ResidualFactors, linearised, solve
@@ -275,9 +275,6 @@ _SHORTEST = 1e-6  # m: a sparse matrix takes 0 for no measurement
 
 def shortest_paths(first: IntArray, second: IntArray, length: FloatArray, poses: int, row: int) -> FloatArray:
     """Lengths (poses,) of shortest paths from a pose along measurements (M,) of these lengths; infinite without one."""
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import dijkstra
-
     low, high = np.minimum(first, second), np.maximum(first, second)
     order = np.lexsort((length, high, low))  # the shortest of several between the same two
     _, once = np.unique(low[order] * poses + high[order], return_index=True)

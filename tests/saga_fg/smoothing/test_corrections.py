@@ -99,15 +99,29 @@ def test_one_object_is_cut_and_two_become_one(builder):
     assert first
     assert second
     assert max(first) < min(second)
-    cars = {"time": 5.0, "x": 10.0, "y": 0.0}
     both = {"what": "same", "at": PEOPLE[0], "and": PEOPLE[1], "value": False}
     later = {"what": "class", "at": PEOPLE[1], "label": "cyclist"}  # of the part after the cut
     cut, problems = corrected(builder, both, later)
     assert not problems
     assert {str(m.tracks.boxes.label[m.tracks.id == 3][0]) for m in cut if 3 in m.tracks.id.tolist()} == {"pedestrian"}
-    joined, problems = corrected(builder, {"what": "same", "at": CAR, "and": cars, "value": True})
+    again = {"what": "same", "at": PEOPLE[0], "and": PEOPLE[1], "value": True}
+    joined, problems = corrected(builder, both, again)
     assert not problems
-    assert not boxes_of(joined, 2)
+    assert not boxes_of(joined, 10**7)
+    assert boxes_of(joined, 3).keys() == boxes_of(cut, 3).keys() | boxes_of(cut, 10**7).keys()
+
+
+def test_what_is_seen_at_two_places_at_once_is_not_one_object(builder):
+    plain, _ = corrected(builder)
+    cars = {"time": 5.0, "x": 10.0, "y": 0.0}
+    found, problems = corrected(builder, {"what": "same", "at": CAR, "and": cars, "value": True})
+    assert problems == ["both are seen at the same time, 30.0 m apart: they are two objects"]
+    assert [m.tracks.id.tolist() for m in found] == [m.tracks.id.tolist() for m in plain]
+
+
+def test_a_cut_between_no_two_detections_is_named(builder):
+    _, problems = corrected(builder, {"what": "same", "at": CAR, "and": CAR, "value": False})
+    assert problems == ["no step between two detections lies between the two times"]
 
 
 def test_an_object_that_nothing_detected(builder):
@@ -188,7 +202,11 @@ BROKEN = [
     ({"what": "same", "at": PLACE}, "and: expected time, x, y"),
     ({"what": "standing", "at": PLACE, "until": -1}, "until: expected a time from 0 s on"),
     ({"what": "box", "at": PLACE, "box": {"x": 1}}, "box: expected x, y, got x"),
-    ({"what": "box", "at": PLACE, "box": {"x": 1, "y": 1, "length": 0}}, "box: length: expected a number above 0"),
+    ({"what": "box", "at": PLACE, "box": {"x": 1, "y": 1, "length": 0}}, "box: length: expected a number from 0.0001"),
+    (
+        {"what": "box", "at": PLACE, "box": {"x": 1, "y": 1}, "deviation": {"position": 1e-300}},
+        "deviation: position: expected a number from 0.0001 on",
+    ),
     (
         {"what": "box", "at": PLACE, "box": {"x": 1, "y": 1}, "deviation": {"yaw": 0}},
         "deviation: yaw: expected a",
