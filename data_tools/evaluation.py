@@ -324,13 +324,18 @@ def own_figures(
     results: Sequence[tuple[Scene, SceneBoxes]], metrics: Iterable[str | Metric]
 ) -> dict[str, dict[str, float]]:
     """The figures of a user's metrics, by the name of each. Raises `InputError` for what is none, naming it."""
+    if callable(metrics) or isinstance(metrics, str):
+        raise InputError("metrics: expected a list of metrics")
     found: dict[str, dict[str, float]] = {}
     pairs = [(SceneBoxes.of_annotations(scene.ground_truth or ()), boxes) for scene, boxes in results]
     for given in metrics:
         metric: Metric = new_part("metric", given, Metric)
         name = given if isinstance(given, str) else getattr(metric, "__name__", type(metric).__name__)
         with of_own_code(f"metric: {name}"):
-            found[name] = {str(key): float(value) for key, value in metric(pairs).items()}
+            figures = metric(pairs)
+            if not isinstance(figures, Mapping):
+                raise InputError(f"expected figures by name, got {type(figures).__name__}")
+            found[name] = {str(key): float(value) for key, value in figures.items()}
     return found
 
 
@@ -402,9 +407,9 @@ class Evaluation:
     own: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        """The summary, or the figures of tracking, as a table for a terminal."""
-        shown = self.summary() or self.tracking
-        return text_table(shown.title, shown.columns, shown.rows)
+        """The summary, or the figures of tracking, and a user's own, as tables for a terminal."""
+        shown = (self.summary() or self.tracking, *self.own_tables())
+        return "\n".join(text_table(table.title, table.columns, table.rows) for table in shown)
 
     def _repr_html_(self) -> str:
         """The tables for a notebook."""
@@ -425,8 +430,12 @@ class Evaluation:
             *error_tables(self.errors),
             *innovations,
             *([hota_table(self.hota)] if self.hota else []),
-            *(FigureTable(name, ("figure", "value"), _cells_of(figures)) for name, figures in self.own.items()),
+            *self.own_tables(),
         ]
+
+    def own_tables(self) -> list[FigureTable]:
+        """Tables of a user's metrics."""
+        return [FigureTable(name, ("figure", "value"), _cells_of(figures)) for name, figures in self.own.items()]
 
     def figures(self) -> dict[str, Any]:
         """Figures for programs."""

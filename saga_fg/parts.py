@@ -119,8 +119,8 @@ def find(what: str, name: object, group: str, own: Mapping[str, Any] = NOTHING) 
     module, _, attribute = location.partition(":")
     try:
         found = import_module(module)
-    except Exception as error:  # of a user's module: anything
-        raise InputError(f"{where}: {module} cannot be imported: {type(error).__name__}: {error}") from error
+    except (Exception, SystemExit) as error:  # of a user's module: anything
+        raise InputError(f"{where}: {module} cannot be imported: {in_one_line(error)}") from error
     try:
         return getattr(found, attribute)
     except AttributeError as error:
@@ -165,7 +165,12 @@ def of_own_code(where: str, what: str = "") -> Iterator[None]:
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
     except Exception as error:  # of a user's module: anything
-        raise InputError(f"{where}: {what}{type(error).__name__}: {error}") from error
+        raise InputError(f"{where}: {what}{in_one_line(error)}") from error
+
+
+def in_one_line(error: BaseException) -> str:
+    """The type and the message of an error."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 def _lacking(role: type, part: object) -> str:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import configparser
 import io
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -48,6 +49,7 @@ from saga_fg.types.track import Tracks
 if TYPE_CHECKING:
     from data_tools.evaluation import Evaluation
 
+log = logging.getLogger(__name__)
 PEDESTRIAN = "pedestrian"
 TABLE = "tracks.csv"
 LARGEST = 10**6  # frame, id, pixel
@@ -127,6 +129,8 @@ class MotSequences:
         for time, rows in zip(times.tolist(), found.by_frame(count), strict=True):
             label = np.full(len(rows), PEDESTRIAN)
             frames.append(Frame(time, "camera", camera.detections(found.xyxy[rows], found.further[rows, 0], label)[0]))
+        if lost := len(found.frame) - sum(map(len, frames)):
+            log.warning("%s: %d of %d boxes left out: they end above the horizon", boxes, lost, len(found.frame))
         truth = self._annotations(name, count) if self._truth else None
         return Scene(name, times, np.tile(np.eye(4), (count, 1, 1)), ("",) * count, frames, truth)
 

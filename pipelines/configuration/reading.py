@@ -281,7 +281,10 @@ def _read_section(schema: Section, data: Any, base: Any, where: str) -> Any:
         if values:
             raise InputError(f"{where}.kind: {data['kind']}: expected a dataclass, whose fields are its settings")
         return as_part(where, cls, schema.part)
-    settings = {setting.name: setting for setting in settings_of(cls)}
+    try:
+        settings = {setting.name: setting for setting in settings_of(cls)}
+    except (TypeError, NameError) as error:  # of a part of a user's own
+        raise InputError(f"{where}: {error}") from error
     for key in values:
         if key not in settings:
             raise InputError(f"{_join(where, key[:40])}: unknown key, {_suggestion(key, settings)}")

@@ -120,7 +120,9 @@ def assert_equal_in_every_step(
 
 def check_methods(make: Make) -> None:
     """All methods of the protocol are there."""
-    lacking = missing(make())
+    estimator = make()
+    require(isinstance(estimator, Estimator), f"expected an Estimator, got {type(estimator).__name__}")
+    lacking = missing(estimator)
     require(not lacking, f"lacks {', '.join(lacking)}")
 
 

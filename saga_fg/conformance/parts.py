@@ -110,7 +110,10 @@ def check_association_cost(cost: AssociationCost, classes: tuple[str, ...] = ("c
         one = AssociationProblem("lidar", 0.5, i + 1, boxes(n, classes), j, boxes(m, classes))
         other = one._replace(id=i[::-1] + 1, tracks=one.tracks.select(i[::-1]))
         other = other._replace(row=j[::-1], detections=one.detections.select(j[::-1]))
-        same("costs in another order", np.asarray(cost(other))[::-1, ::-1], cost(one), 1e-9, (n, m))
+        costs = [np.asarray(cost(each)) for each in (one, other)]
+        for each in costs:
+            require(each.shape == (n, m), f"costs: expected shape {(n, m)}, got {each.shape}")
+        same("costs in another order", costs[1][::-1, ::-1], costs[0], 1e-9)
     tracked(TrackerSettings(association=AssociationSettings(costs=(cost,))), classes=classes)
 
 

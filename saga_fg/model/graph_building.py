@@ -9,7 +9,7 @@ import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.model.edge_rules import EdgeRule, Pairs
-from saga_fg.model.interactions import NodeTable, applies
+from saga_fg.model.interactions import NodeTable, Triples, applies
 from saga_fg.model.motion import distinct_types
 from saga_fg.model.scene_graph import Edges, NonlinearEdges, RecordedMotions, SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_rows, unchecked
@@ -68,8 +68,12 @@ def build_graph(
                     continue
                 ends = {"target": row[t], "source": row[s], "rate": rate[mine]}
                 if hasattr(law, "triples"):
-                    triples = law.triples(nodes, t, s)._asdict()
-                    groups.append(_made(Edges, shipped, interaction=type(law).__name__, **ends, **triples))
+                    triples = law.triples(nodes, t, s)
+                    if not isinstance(triples, Triples):
+                        what = f"interaction {type(law).__name__}: triples"
+                        raise InputError(f"{what}: expected Triples, got {type(triples).__name__}")
+                    columns = triples._asdict()
+                    groups.append(_made(Edges, shipped, interaction=type(law).__name__, **ends, **columns))
                 else:
                     ends["given"] = law.given(nodes, t, s)
                     nonlinear.append(_made(NonlinearEdges, shipped, law=law, **ends))
@@ -100,6 +104,8 @@ def _checked_pairs(rule: EdgeRule, nodes: NodeTable) -> Pairs:
     """The pairs of a user's rule; `InputError` for rows or rates that are not valid."""
     what = f"edge rule {type(rule).__name__}"
     pairs = rule.pairs(nodes)
+    if not (isinstance(pairs, tuple) and len(pairs) == 3):
+        raise InputError(f"{what}: expected Pairs (target, source, rate), got {type(pairs).__name__}")
     target = checked_rows(f"{what}: target", pairs[0])
     source = checked_rows(f"{what}: source", pairs[1], len(target))
     for name, rows in (("target", target), ("source", source)):

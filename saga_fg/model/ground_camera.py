@@ -47,7 +47,7 @@ class GroundCamera(Settings):
     height: Positive = setting(5.0, "height of the camera above the ground, m")
     yaw: Finite = setting(0.0, "direction of view about z, from x towards y, rad")
     pitch: Finite = setting(0.2, "angle of the view below the horizon, rad; higher: looks further down")
-    roll: Finite = setting(0.0, "angle about the direction of view, rad; higher: the image turns clockwise")
+    roll: Finite = setting(0.0, "angle about the direction of view, rad; higher: the camera turns clockwise")
     deviation: Positive = setting(
         0.05, "standard deviation of a foot point as a share of the height of its box; usual 0.02 to 0.1"
     )

@@ -54,6 +54,7 @@ from saga_fg.numerics.assignment import (
     pair_costs,
 )
 from saga_fg.numerics.gating import near_pairs
+from saga_fg.parts import of_own_code
 from saga_fg.tracking.class_belief import NONE_CONFUSED, ConfusedClasses
 from saga_fg.tracking.given_identities import identity_cost
 from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
@@ -125,7 +126,8 @@ def _own_cost(state: TrackerState, measurements: FrameMeasurements, predicted: B
     )
     total = np.zeros((len(predicted), len(measurements)))
     for k, cost in enumerate(state.costs):
-        given = np.asarray(cost(problem), dtype=np.float64)
+        with of_own_code(f"association.costs[{k}]"):
+            given = np.asarray(cost(problem), dtype=np.float64)
         if given.shape != total.shape or not (given > -math.inf).all():
             what = f"shape {given.shape}" if given.shape != total.shape else "NaN or -infinity"
             raise InputError(f"association.costs[{k}]: expected numbers of shape {total.shape}, got {what}")

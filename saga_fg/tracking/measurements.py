@@ -30,7 +30,16 @@ from saga_fg.errors import InputError
 from saga_fg.graph import EGO_POSE, key_of
 from saga_fg.model.interactions import POSITION, NodeTable
 from saga_fg.model.sensor import MAX_MEASURED_SPEED, Sensor
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, of_classes, unchecked
+from saga_fg.numerics.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    StrArray,
+    checked,
+    checked_covariances,
+    of_classes,
+    unchecked,
+)
 from saga_fg.numerics.gating import near_pairs
 from saga_fg.numerics.geometry import yaw_of
 from saga_fg.tracking.class_belief import NONE_CONFUSED, ConfusedClasses
@@ -107,6 +116,11 @@ def frame_measurements(
     detections = sensor.in_world(frame)
     label = detections.boxes.label
     probability = sensor.probability(detections.score, label)
+    if type(sensor) is not Sensor:
+        where = f"sensors: {type(sensor).__name__}.probability"
+        probability = checked(where, probability, (len(label),))
+        if len(label) and not (probability.min() > 0 and probability.max() < 1):
+            raise InputError(f"{where}: expected numbers above 0 and below 1")
     objects = ~of_classes(label, COLOUR_LABELS)  # the colours of lights are not objects of their own
     keep = (objects & (probability >= class_values(classes, ClassSettings, label, "min_score")[0])).nonzero()[0]
     detections, probability, viewpoint = detections.select(keep), probability[keep], sensor.origin(frame)
@@ -122,6 +136,8 @@ def frame_measurements(
         likelihood = likelihood[kept]
     boxes = detections.boxes
     R = sensor.detection_covariance(detections, viewpoint, probability)
+    if type(sensor) is not Sensor:
+        R = checked_covariances(f"sensors: {type(sensor).__name__}.detection_covariance", R, len(boxes), 4)
     yaw_noise, z_noise = sensor.deviations(boxes.label, "yaw", "height")
     limit = MAX_MEASURED_SPEED if sensor.use_velocity else -1.0
     covariance_scale, position_bias = sensor.covariance_calibration(boxes.label, probability)

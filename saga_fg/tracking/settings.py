@@ -134,6 +134,13 @@ class ClassSettings(Settings):
         0.3, "standard deviation of the change of heading in one second, rad; higher: follows detections faster"
     )
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        try:
+            hash(self.motion)
+        except TypeError as error:
+            raise InputError(f"motion: expected one that has a hash, as a frozen dataclass: {error}") from error
+
 
 @dataclass(frozen=True)
 class AssociationSettings(Settings):

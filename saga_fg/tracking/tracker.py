@@ -26,7 +26,7 @@ from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.model.sensor import Sensor, checked_sensors, sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import Assignment
-from saga_fg.parts import KINDS, new_part
+from saga_fg.parts import KINDS, in_one_line, new_part
 from saga_fg.tracking.association import associate
 from saga_fg.tracking.by_name import estimator_name
 from saga_fg.tracking.clock import TimeVerdict
@@ -146,11 +146,14 @@ class Tracker:
             *((f"edges[{k}]", rule) for k, rule in enumerate(edges)),
             (f"estimator: {estimator_name(settings.estimator)}", self._state.joint.estimator),
         ]
-        modules = [(getattr(part, "__module__", "saga_fg."), where) for where, part in parts]
-        where_of = {module: where for module, where in modules if not module.startswith("saga_fg.")}
-        calls = [frame.f_globals.get("__name__", "") for frame, _ in walk_tb(error.__traceback__)]
-        blamed = [where_of[module] for module in calls if module in where_of]
-        return InputError(f"{blamed[-1]}: {type(error).__name__}: {error}") if blamed else None
+        modules = [(getattr(part, "__module__", "saga_fg."), where, part) for where, part in parts]
+        own = [one for one in modules if not one[0].startswith("saga_fg.")]
+        calls = [call for call, _ in walk_tb(error.__traceback__)]
+        blamed = [where for call in calls for _, where, part in own if call.f_locals.get("self") is part]
+        if not blamed:
+            names = [call.f_globals.get("__name__") for call in calls]
+            blamed = [where for name in names for module, where, _ in own if module == name]
+        return InputError(f"{blamed[-1]}: {in_one_line(error)}") if blamed else None
 
     def _step(self, state: TrackerState, frame: Frame) -> Tracks:
         """Take a frame into a state."""
@@ -308,8 +311,8 @@ class Tracker:
 
     @property
     def noise_scales(self) -> dict[str, float]:
-        """Of the sensors with `calibrate_noise`, what the deviations of their models are to be multiplied by."""
-        return {name: noise.scale for name, noise in self._state.noise.items()}
+        """Of the sensors with `calibrate_noise`, what the deviations of their models are multiplied by, once known."""
+        return {name: noise.scale for name, noise in self._state.noise.items() if noise.seen}
 
     @property
     def late_frames(self) -> int:

@@ -60,6 +60,8 @@ def test_metrics_of_ones_own_stand_beside(tracks):
     found = saga_fg.evaluate(tracks, TRUTH, metrics=[boxes])
     assert found.figures()["own"] == {"boxes": {"found": len(tracks)}}
     assert found.tables()[-1].title == "boxes"
+    assert "AMOTA" in repr(found)
+    assert "boxes\nfigure" in repr(found).replace(" ", "")
     with pytest.raises(InputError, match="metric: <lambda>: ZeroDivisionError"):
         saga_fg.evaluate(tracks, TRUTH, metrics=[lambda scenes: 1 / 0])
 

@@ -102,6 +102,36 @@ class Breaks:
     def pairs(self, nodes):
         return 1 / 0
 
+class BreaksIn(Sensor):
+    def detection_covariance(self, detections, origin, probability=None):
+        return np.full((len(detections), 4, 4), np.nan)
+
+class Doubtless(Sensor):
+    def probability(self, score, label):
+        return np.full(len(score), 2.0)
+
+class Idle:
+    interaction = SharedVelocity()
+
+    def pairs(self, nodes):
+        return None
+
+class Changing(Drag):
+    __hash__ = None
+
+@dataclass(frozen=True)
+class Matrix(Drag):
+    A: np.ndarray = None
+
+def missing_key(problem):
+    return {}["key"]
+
+def no_numbers(problem):
+    return [["a"] * len(problem.detections)] * len(problem.tracks)
+
+def no_argument():
+    return 0.0
+
 def recall(scenes):
     true, found = (sum(map(len, each)) for each in zip(*scenes, strict=True))
     return {"recall": found / true}
@@ -238,6 +268,34 @@ def test_what_breaks_is_named(mine, subtests):
         run(Tracker(TrackerSettings(association=AssociationSettings(costs=(flat,)))))
 
 
+def test_the_part_that_fails_is_named_also_beside_others_of_its_module(mine, subtests):
+    def costs(*some):
+        return replace(settings, association=AssociationSettings(costs=some))
+
+    settings = TrackerSettings(classes={"default": ClassSettings(motion=mine.Drag())}, edges=(mine.Chain(),))
+    for found, sensor, message in [
+        (costs(mine.alike, mine.missing_key), Sensor(), r"association.costs\[1\]: KeyError: 'key'"),
+        (costs(mine.no_numbers), Sensor(), r"association.costs\[0\]: ValueError: could not convert"),
+        (costs(mine.no_argument), Sensor(), r"association.costs\[0\]: TypeError: no_argument\(\) takes 0"),
+        (replace(settings, edges=(mine.Breaks(), mine.Chain())), Sensor(), r"edges\[0\]: ZeroDivisionError"),
+        (replace(settings, edges=(mine.Idle(),)), Sensor(), "edge rule Idle: expected Pairs .* got NoneType"),
+        (settings, mine.BreaksIn(), "BreaksIn.detection_covariance.*: expected a finite number"),
+        (settings, mine.Doubtless(), "Doubtless.probability: expected numbers above 0 and below 1"),
+    ]:
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            run(Tracker(found, {"lidar": sensor}))
+    with pytest.raises(InputError, match="motion: expected one that has a hash"):
+        ClassSettings(motion=mine.Changing())
+    with pytest.raises(InputError, match=r"a.motion: Matrix.A: .* has no YAML form"):
+        configured("tracker: {classes: {a: {motion: 'my_parts:Matrix'}}}")
+
+
+def test_a_module_that_ends_the_program_is_an_error_in_one_line(tmp_path):
+    (tmp_path / "ends.py").write_text("raise SystemExit('two\\nlines')")
+    with pytest.raises(InputError, match=r"ends cannot be imported: SystemExit: two lines$"):
+        Tracker(TrackerSettings(estimator="ends:Filter"))
+
+
 @pytest.mark.parametrize(
     ("check", "part"),
     [
@@ -286,7 +344,7 @@ class WrongSlope:
         (
             check_association_cost,
             lambda p: np.zeros((1, 1)),
-            r"costs in another order: expected shape \(3, 5\), got \(1, 1\)",
+            r"costs: expected shape \(3, 5\), got \(1, 1\)",
         ),
         (
             check_association_cost,
@@ -313,3 +371,7 @@ def test_a_metric_by_its_entry_point():
         own_figures([], ["recal"])
     with pytest.raises(InputError, match="metric: recall: "):
         own_figures([], ["recall"])  # no scene to unzip
+    with pytest.raises(InputError, match="metric: <lambda>: expected figures by name, got float"):
+        own_figures([], [lambda scenes: 1.0])
+    with pytest.raises(InputError, match="metrics: expected a list"):
+        own_figures([], "recall")

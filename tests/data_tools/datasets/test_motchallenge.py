@@ -167,6 +167,21 @@ def test_mistakes_are_one_line(sequences, tmp_path, subtests):
     assert "expected sequences with det/det.txt" in refused("track", "motchallenge", tmp_path, *command[3:])
 
 
+def test_boxes_above_the_horizon_are_told_and_left_out(sequences, caplog):
+    detections, source = sequences / "SEQ-01/det/det.txt", MotChallengeSource(folder=str(sequences), camera=CAMERA)
+
+    def found():
+        with source.open() as dataset:
+            return sum(map(len, dataset.scene("SEQ-01").frames))
+
+    count = found()
+    assert not caplog.records
+    rows = len(detections.read_text().splitlines())
+    detections.write_text(detections.read_text() + "1,-1,900,-9000,40,20,0.9,-1,-1,-1\n")
+    assert found() == count
+    assert f"1 of {rows + 1} boxes left out: they end above the horizon" in caplog.text
+
+
 def test_detections_are_numbered_as_by_other_trackers():
     tracker, seen = IdentityTracker(CAMERA, frame_rate=10.0, classes={0: "pedestrian"}), []
     for k in range(10):

@@ -92,3 +92,10 @@ def test_models_are_scaled_in_positions_alone():
     scaled = scaled_sensors({}, {"table": 2.0})["table"].noise["default"]
     usual = Sensor().noise["default"]
     assert (scaled.position, scaled.velocity, scaled.yaw) == (2 * usual.position, usual.velocity, usual.yaw)
+
+
+def test_nothing_is_told_where_detections_bring_their_covariances():
+    tracker = Tracker(sensors=TABLE)
+    for frame, _ in frames(0.1, position_covariance=np.tile(0.01 * np.eye(2), (6, 1, 1))):
+        tracker.step(frame)
+    assert tracker.noise_scales == {}
