@@ -203,7 +203,8 @@ def _named(table: NDArray[Any]) -> Columns:
     names = ["x", "y", "z", "intensity"][: table.shape[1]]
     for column in table[:, 4:].T:
         name = f"column {len(names) + 1}"
-        whole = bool((column == np.floor(column)).all())
+        with np.errstate(invalid="ignore"):  # a signalling NaN
+            whole = bool((column == np.floor(column)).all())
         if whole and "ring" not in names and column.min() >= 0 and column.max() < 256:
             name = "ring"
         elif not whole and "time" not in names and np.abs(column).max() < _TURN and _grows(column):

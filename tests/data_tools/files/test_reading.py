@@ -187,6 +187,7 @@ SIZES = {
     "nuScenes results": 2,
     "KITTI": 3,
     "KITTI results": 1,
+    "MOTChallenge": 3,
     "detections, CSV": 1,
     "detections, NDJSON": 1,
     "detections, NumPy": 1,
