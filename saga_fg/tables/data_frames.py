@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.tables.column_names import Clock, TableImport, understood
 from saga_fg.tables.columns import COLUMNS, NAMED, REQUIRED, RawTable, Values, as_names, clock_of
 from saga_fg.tables.detections import DetectionTable, sorted_by_time
@@ -47,7 +47,8 @@ def raw_table(
         raise InputError(f"{expected}, got {type(table).__name__}") from error
     except nw.exceptions.NarwhalsError as error:
         raise InputError(f"{NAME}: expected every column once: {str(error).splitlines()[0]}") from error
-    how = how or TableImport()
+    how = TableImport() if how is None else how
+    require_type("how", how, TableImport)
     found = understood(names, columns, required, how.columns)
     if found.faults:
         raise InputError(f"{NAME}: {'; '.join(found.faults)}")

@@ -73,9 +73,10 @@ class IdentityTracker:
                 "detections with xyxy" if self.camera is not None else "saga_fg.Detections, as there is no camera"
             )
             raise InputError(f"detections: expected {expected}, got {type(detections).__name__}")
-        xyxy = np.asarray(detections.xyxy, dtype=np.float64)
+        xyxy = checked("xyxy", detections.xyxy, (None, 4))
         score, class_id = (getattr(detections, name, None) for name in ("confidence", "class_id"))
         score = np.ones(len(xyxy)) if score is None else checked("confidence", score, (len(xyxy),))
-        names = [UNNAMED] * len(xyxy) if class_id is None else [self.classes.get(int(k), str(int(k))) for k in class_id]
+        numbers = [] if class_id is None else checked("class_id", class_id, (len(xyxy),)).astype(np.int64).tolist()
+        names = [UNNAMED] * len(xyxy) if class_id is None else [self.classes.get(k, str(k)) for k in numbers]
         label = np.array(names, dtype=np.str_)
         return self.camera.detections(xyxy, score, label)

@@ -67,6 +67,8 @@ def test_metrics_of_ones_own_stand_beside(tracks):
 
 
 def test_tables_that_do_not_fit_are_refused(tracks):
+    with pytest.raises(InputError, match=r"how: expected .*TableImport.*dict"):
+        saga_fg.evaluate(tracks, TRUTH, {"columns": {"x": "pos_x"}})
     with pytest.raises(InputError, match="expected tracks at the times of the ground truth"):
         saga_fg.evaluate(tracks, TRUTH.assign(timestamp=TRUTH.timestamp + 100))
     with pytest.raises(InputError, match="expected a column 'id'"):

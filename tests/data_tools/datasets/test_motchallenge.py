@@ -207,5 +207,13 @@ def test_detections_in_the_world_are_numbered_too():
         tracker.update(SimpleNamespace(xyxy=np.zeros((1, 4))))
     with pytest.raises(InputError, match=r"xyxy\[0\]: expected left < right and top < bottom"):
         IdentityTracker(CAMERA).update(SimpleNamespace(xyxy=np.zeros((1, 4))))
+    for wrong, message in (
+        ({"xyxy": np.zeros(4)}, r"xyxy: expected shape"),
+        ({"class_id": ["person"]}, r"class_id: expected numbers"),
+        ({"class_id": [0, 1]}, r"class_id: expected shape \(1,\)"),
+        ({"confidence": []}, r"confidence: expected shape \(1,\)"),
+    ):
+        with pytest.raises(InputError, match=message):
+            IdentityTracker(CAMERA).update(SimpleNamespace(**{"xyxy": np.array([[0.0, 0, 9, 9]])} | wrong))
     with pytest.raises(InputError, match="frame_rate: expected a number > 0"):
         IdentityTracker(CAMERA, frame_rate=0)
