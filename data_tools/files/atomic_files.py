@@ -30,7 +30,8 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
     """Open `path` for writing bytes; it appears, or is replaced, when the block ends without an exception.
 
     The temporary file is opened at once, so that a folder which is not writable is an error before any work is done.
-    Raises `InputError` if the folder is missing or not writable, if `path` is not a regular file, or the disk full.
+    Raises `InputError` if the folder is missing or not writable, if `path` is read-only or no regular file, or the disk
+    full.
     """
     final, temporary, file = _opened(path)
     try:
@@ -116,6 +117,8 @@ def _opened(path: str | Path) -> tuple[Path, Path, BinaryIO]:
     if final.exists() and not final.is_file():
         kind = "a folder" if final.is_dir() else "no regular file"
         raise InputError(f"{path}: expected the name of a file to write, this is {kind}")
+    if final.exists() and not final.stat().st_mode & 0o222:  # a folder one may write to would let it be replaced
+        raise InputError(f"{path}: not writable: the file is read-only")
     temporary = _temporary(final)
     try:
         file = temporary.open("xb")

@@ -25,7 +25,7 @@ import numpy as np
 from data_tools.datasets.corrections import check_classes, corrections_of_lines
 from data_tools.datasets.detection_files import read_tracks
 from data_tools.datasets.results import SceneResult, scene_result
-from data_tools.files.atomic_files import write_text
+from data_tools.files.atomic_files import check_writable, write_text
 from data_tools.files.input_files import open_text, read_text
 from data_tools.files.readers import parsed_json
 from data_tools.metrics import SceneBoxes
@@ -160,6 +160,7 @@ class ReviewSession:
         if any(line.strip() for line in lines):
             write_text(self.file, "".join(f"{line}\n" for line in lines))
         else:
+            check_writable(self.file)
             self.file.unlink(missing_ok=True)
 
     def _known(self, scene: str) -> ReportScene:

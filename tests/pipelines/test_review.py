@@ -303,6 +303,18 @@ def test_a_failure_while_writing_changes_nothing(server, labels, monkeypatch):
     assert client.state("a") == before
 
 
+def test_a_file_that_is_read_only_stays_as_it_is(server, labels):
+    client, file = Client(server), labels / CORRECTIONS
+    gone = {"what": "exists", "at": at(1.0, 20.0, 8.0), "value": False, "scene": "a"}
+    file.write_text(json.dumps(gone) + "\n")
+    file.chmod(0o444)
+    client.state("a")
+    for status, answer in (client.correct(**gone), client.undo("a")):
+        assert (status, answer["error"]) == (422, f"{file}: not writable: the file is read-only")
+    assert file.read_text() == json.dumps(gone) + "\n"
+    assert f"{file}: not writable" in refused("review", labels)
+
+
 def test_a_file_that_is_changed_or_broken_by_hand_is_seen(server, labels):
     client = Client(server)
     client.state("a")
