@@ -1,7 +1,7 @@
 """The noise of a sensor of which nothing is known, told by its own successive detections, without ground truth.
 
-A divided difference of order k of an object's k + 1 successive detections z_j at times t_j is free of all motion along
-a polynomial of degree k - 1 in time. What is left is noise, of a known share of the variance of a detection:
+A divided difference of order k of an object's k + 1 detections z_j at times t_j, `STEP` apart, is free of all motion
+along a polynomial of degree k - 1 in time. What is left is noise, of a known share of the variance of a detection:
 
     D_k = sum over j of c_j z_j,   c_j = product over i /= j of 1 / (t_j - t_i),   cov D_k = R sum over j of c_j^2
     s^2 = least over k = 1, 2, 3 of the 90 % quantile of ( D_k^T R^-1 D_k / sum of c_j^2 ) / chi^2_2(90 %)
@@ -12,7 +12,7 @@ with too small ones a tracker would only see the small errors.
 
 More noise than the model says widens gates and slows the filter (factor max(s, 1) on the deviations R). Less noise
 narrows the reported ellipses alone (min(s, 1), `saga_fg.tracking.reporting`): errors that all detections of an object
-share do not show in differences, and a filter that believes too much loses objects. Where successive detections differ
+share do not show in differences, and a filter that believes too much loses objects. Where these detections differ
 by less than a detector errs, their errors are mostly shared: such an s is not believed, and 1 is taken.
 
 Source: von Neumann, Kent, Bellinson, Hart, The mean square successive difference, Annals of Mathematical Statistics
@@ -22,7 +22,7 @@ Source: von Neumann, Kent, Bellinson, Hart, The mean square successive differenc
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +34,7 @@ from saga_fg.numerics.gating import chi_square_quantile
 from saga_fg.tracking.measurements import FrameMeasurements
 
 ORDERS = (1, 2, 3)
+STEP = 0.4  # s between detections that are compared: errors that last longer are shared by all of them
 QUANTILE = 0.9
 LEAST, MOST = 1 / 3, 10 / 3  # bounds of s
 SHARED = (0.18, 0.28)  # s, from which differences are no longer believed, and are believed
@@ -50,7 +51,7 @@ class SensorNoise:
 
     scale    s: factor on the standard deviations of its model
     seen     number of differences so far
-    frames   the latest frames, oldest first
+    frames   the latest frames, oldest first, as far back as they are compared
     squares  by order, the latest squared differences in units of the model's noise
     """
 
@@ -63,16 +64,27 @@ class SensorNoise:
         """What is known after a frame at a time, s: positions (n, 2), m, of tracks (n,); R (n, 2, 2) by the model."""
         if self.seen >= ENOUGH or (self.frames and time <= self.frames[-1][0]):
             return self
-        frames = (*self.frames[-ORDERS[-1] :], (time, track, position))
+        frames = (*self.frames, (time, track, position))
+        compared = _apart(frames)
         common, rows, squares, seen = track, np.arange(len(track)), list(self.squares), 0
         columns = [position]
-        for order, (_, tracks, places) in enumerate(reversed(frames[:-1]), 1):
+        for order, (_, tracks, places) in enumerate(compared[1:], 1):
             common, kept, before = np.intersect1d(common, tracks, assume_unique=True, return_indices=True)
             rows, columns = rows[kept], [*(column[kept] for column in columns), places[before]]
-            found = _squares(np.array([at for at, _, _ in frames[: -order - 2 : -1]]), np.stack(columns), R[rows])
+            found = _squares(np.array([at for at, _, _ in compared[: order + 1]]), np.stack(columns), R[rows])
             squares[order - 1] = np.concatenate([squares[order - 1], found])[-LATEST:]
             seen += len(found)
-        return SensorNoise(_scale(squares), self.seen + seen, frames, tuple(squares))
+        needed = frames if len(compared) <= ORDERS[-1] else tuple(f for f in frames if f[0] >= compared[-1][0])
+        return SensorNoise(_scale(squares), self.seen + seen, needed, tuple(squares))
+
+
+def _apart(frames: Sequence[_Detections]) -> list[_Detections]:
+    """The newest frame and those before it that are `STEP` and more from one another, as many as are compared."""
+    found = [frames[-1]]
+    for frame in reversed(frames[:-1]):
+        if len(found) <= ORDERS[-1] and found[-1][0] - frame[0] >= STEP - 1e-6:
+            found.append(frame)
+    return found
 
 
 def _squares(time: FloatArray, position: FloatArray, R: FloatArray) -> FloatArray:

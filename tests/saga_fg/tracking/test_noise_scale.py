@@ -57,7 +57,7 @@ def test_ellipses_of_a_table_hold_what_they_say(sigma):
         tracker = Tracker(TrackerSettings(min_hits=2), TABLE)
         for frame, truth in frames(sigma, seed=seed):
             tracks = tracker.step(frame)
-            if frame.timestamp < 1.0:  # until then little is known
+            if frame.timestamp < 3.0:  # until then little is known
                 continue
             apart = tracks.boxes.position[:, None, :2] - truth
             error = apart[np.arange(len(tracks)), np.linalg.norm(apart, axis=2).argmin(axis=1)]
