@@ -40,7 +40,8 @@ LEAST, MOST = 1 / 3, 10 / 3  # bounds of s
 SHARED = (0.18, 0.28)  # s, from which differences are no longer believed, and are believed
 UNKNOWN = 2.0  # s of gates, before it is known
 FEWEST, PRIOR, LATEST = 15, 3, 300  # differences of an order: for an estimate, that s = 1 counts for, that are kept
-ROUGHLY, ENOUGH = 300, 900  # differences, from which gates follow s, and from which s stays
+ROUGHLY = 300  # differences, from which gates follow s
+SETTLED = 10.0  # s from a sensor's first detections, after which s stays
 
 _Detections = tuple[float, IntArray, FloatArray]  # time, s, tracks (n,) and positions (n, 2), m, of a frame
 
@@ -50,20 +51,27 @@ class SensorNoise:
     """What the detections of a sensor say of its noise.
 
     scale    s: factor on the standard deviations of its model
+    settled  whether s stays
+    start    time of its first detections, s, NaN before
     seen     number of differences so far
     frames   the latest frames, oldest first, as far back as they are compared
     squares  by order, the latest squared differences in units of the model's noise
     """
 
     scale: float = 1.0
+    settled: bool = False
+    start: float = math.nan
     seen: int = 0
     frames: tuple[_Detections, ...] = ()
     squares: tuple[FloatArray, ...] = (np.empty(0),) * len(ORDERS)
 
     def observed(self, time: float, track: IntArray, position: FloatArray, R: FloatArray) -> SensorNoise:
         """What is known after a frame at a time, s: positions (n, 2), m, of tracks (n,); R (n, 2, 2) by the model."""
-        if self.seen >= ENOUGH or (self.frames and time <= self.frames[-1][0]):
+        if self.settled or not len(track) or (self.frames and time <= self.frames[-1][0]):
             return self
+        start = time if math.isnan(self.start) else self.start
+        if time > start + SETTLED:
+            return SensorNoise(self.scale, settled=True, seen=self.seen)
         frames = (*self.frames, (time, track, position))
         compared = _apart(frames)
         common, rows, squares, seen = track, np.arange(len(track)), list(self.squares), 0
@@ -75,7 +83,7 @@ class SensorNoise:
             squares[order - 1] = np.concatenate([squares[order - 1], found])[-LATEST:]
             seen += len(found)
         needed = frames if len(compared) <= ORDERS[-1] else tuple(f for f in frames if f[0] >= compared[-1][0])
-        return SensorNoise(_scale(squares), self.seen + seen, needed, tuple(squares))
+        return SensorNoise(_scale(squares), False, start, self.seen + seen, needed, tuple(squares))
 
 
 def _apart(frames: Sequence[_Detections]) -> list[_Detections]:
@@ -119,7 +127,7 @@ def with_scale(measurements: FrameMeasurements, noise: SensorNoise) -> FrameMeas
 
 def for_gates(measurements: FrameMeasurements, noise: SensorNoise) -> FrameMeasurements:
     """The measurements of `with_scale` as they are to be gated: with more noise as long as it is not known."""
-    if noise.seen >= ROUGHLY:
+    if noise.settled or noise.seen >= ROUGHLY:
         return measurements
     free, R = measurements.by_model, measurements.R.copy()
     R[free, :2, :2] *= UNKNOWN**2

@@ -69,6 +69,7 @@ class Recorder:
         self.seen: list[float] = []
         self.predicted: list[float] = []
         self.sensor_times: dict[str, Any] = {}
+        self.noise_scales: dict[str, float] = {}
 
     def step(self, frame: Frame) -> Tracks:
         self.seen.append(frame.timestamp)

@@ -352,7 +352,7 @@ def test_the_first_step_is_that_of_a_tracker_with_the_same_settings_and_rules(sc
     compared = 0
     for frame in scene.frames:
         kf.step(frame)
-        tracker = Tracker(settings, SENSORS, rules)
+        tracker = Tracker(dataclasses.replace(settings, edges=rules), SENSORS)
         tracker.restore(kf.snapshot())
         later = tracker.tracks(frame.timestamp + STEP)
         present = tracker.tracks(frame.timestamp)

@@ -40,6 +40,15 @@ def test_the_scale_stays_within_bounds_and_waits_for_evidence():
     assert seen(0.3, lambda t: np.zeros(2), rng, frames=2, objects=5).scale == 1.0
 
 
+def test_the_scale_stays_after_the_first_seconds():
+    rng, R = np.random.default_rng(3), np.tile(MODEL**2 * np.eye(2), (8, 1, 1))
+    noise = seen(0.15, lambda t: np.zeros(2), rng, frames=120)
+    later = noise.observed(60.0, np.arange(8), rng.normal(0, 9, (8, 2)), R)
+    assert noise.settled
+    assert later.scale == noise.scale == pytest.approx(0.5, rel=0.2)
+    assert later.seen == noise.seen > 0
+
+
 def frames(sigma, count=80, seed=0, **columns):
     rng = np.random.default_rng(seed)
     start = np.stack([15.0 * np.arange(6), 4.0 * np.arange(6)], axis=1)
