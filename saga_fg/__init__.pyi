@@ -7,6 +7,7 @@ from .model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, N
 from .model.scene_graph import Edges, SceneGraph
 from .model.sensor import Sensor
 from .smoothing import smooth
+from .tables.column_names import TableImport
 from .tables.data_frames import frames_of
 from .tracking import GreedyTracker, IdentityTracker, Tracker, TrackerSettings, track
 from .types.boxes import Boxes
@@ -41,6 +42,7 @@ __all__ = [
     "Scene",
     "SceneGraph",
     "Sensor",
+    "TableImport",
     "Track",
     "Tracker",
     "TrackerSettings",
