@@ -23,7 +23,7 @@ from saga_fg.types.dataset import Dataset
 
 @dataclass(frozen=True)
 class LabelRun:
-    """What labels follow from.
+    """All that labels follow from.
 
     dataset      name, or MODULE:CLASS; options: its own, as YAML
     tracks       files of other trackers; corrections: a file, "" for none

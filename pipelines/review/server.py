@@ -102,7 +102,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(status, content)
 
     def _content(self) -> Any:
-        """What the request asks for."""
+        """The answer to the request."""
         hosts = {f"{name}:{self.server.server_port}" for name in ("127.0.0.1", "localhost")}
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
         if host not in hosts or origin not in (None, f"http://{host}"):

@@ -194,7 +194,7 @@ class MovingObjects:
 
 @dataclass(frozen=True, eq=False)
 class FrontEnd:
-    """What is particular to a sensor.
+    """The parts of SLAM that are particular to a sensor.
 
     odometry  registers each scan with a local map
     submaps   settings of the graph; spacing: of the points that submaps keep, m

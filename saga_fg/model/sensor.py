@@ -146,7 +146,7 @@ class ScoreCalibration(Settings):
 
 @part_kind("class model", "saga_fg.class_models")
 class ClassModel(Protocol):
-    """What the boxes of a detector say about the classes of their objects."""
+    """Evidence of a detector's boxes about the classes of their objects."""
 
     @property
     def classes(self) -> tuple[str, ...]:

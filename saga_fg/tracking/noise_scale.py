@@ -48,7 +48,7 @@ _Detections = tuple[float, IntArray, FloatArray]  # time, s, tracks (n,) and pos
 
 @dataclass(frozen=True, eq=False)
 class SensorNoise:
-    """What the detections of a sensor say of its noise.
+    """The noise of a sensor, as far as its detections tell it.
 
     scale    s: factor on the standard deviations of its model
     settled  whether s stays
@@ -66,7 +66,7 @@ class SensorNoise:
     squares: tuple[FloatArray, ...] = (np.empty(0),) * len(ORDERS)
 
     def observed(self, time: float, track: IntArray, position: FloatArray, R: FloatArray) -> SensorNoise:
-        """What is known after a frame at a time, s: positions (n, 2), m, of tracks (n,); R (n, 2, 2) by the model."""
+        """Take in a frame at a time, s: positions (n, 2), m, of tracks (n,), with R (n, 2, 2) by the model."""
         if self.settled or not len(track) or (self.frames and time <= self.frames[-1][0]):
             return self
         start = time if math.isnan(self.start) else self.start
@@ -137,7 +137,7 @@ def for_gates(measurements: FrameMeasurements, noise: SensorNoise) -> FrameMeasu
 def observed(
     noise: SensorNoise, measurements: FrameMeasurements, matching: Matching, track: IntArray, time: float
 ) -> SensorNoise:
-    """What is known after the measurements of a frame at `time`, s, as they were before `with_scale`.
+    """Take in the measurements of a frame at `time`, s, as they were before `with_scale`.
 
     Measurements count that are matched beyond doubt and have the noise of the model. track (k,): of the matching
     """

@@ -311,7 +311,7 @@ class Tracker:
 
     @property
     def noise_scales(self) -> dict[str, float]:
-        """Of the sensors with `calibrate_noise`, what the deviations of their models are multiplied by, once known."""
+        """The factors on the deviations of the models of sensors with `calibrate_noise`, once known."""
         return {name: noise.scale for name, noise in self._state.noise.items() if noise.seen}
 
     @property

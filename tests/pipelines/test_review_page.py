@@ -71,7 +71,7 @@ def running(labels: Path, file: Path) -> Iterator[ReviewServer]:
 
 
 def seen(server: ReviewServer, script: str, folder: Path, hash_: str = "") -> Any:
-    """What a window finds that is opened now."""
+    """The state that a window finds that is opened now."""
     vars(server.session)["script"] = script
     found = found_at(server.url + hash_, folder)
     assert found["faults"] == []

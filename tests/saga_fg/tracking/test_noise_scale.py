@@ -11,7 +11,7 @@ TABLE = {"default": Sensor(calibrate_noise=True)}
 
 
 def seen(sigma, motion, rng, frames=60, objects=8, jitter=0.0):
-    """What is known after frames of objects that move by `motion(t)` (2,), with white errors."""
+    """The noise after frames of objects that move by `motion(t)` (2,), with white errors."""
     noise, time = SensorNoise(), 0.0
     start = rng.uniform(-50, 50, (objects, 2))
     for _ in range(frames):
