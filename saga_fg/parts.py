@@ -174,7 +174,7 @@ def in_one_line(error: BaseException) -> str:
 
 
 def _lacking(role: type, part: object) -> str:
-    """Return what a part lacks to be of a role, "" if it has all: `derived from ...` or `with its members; it lacks ...`."""
+    """Return what a part lacks of a role, "" if it has all: `derived from ...` or `with its members; it lacks ...`."""
     if not getattr(role, "_is_protocol", False):
         return "" if isinstance(part, role) else f"derived from {role.__module__}.{role.__qualname__}"
     members = {name: each for name, each in vars(role).items() if name == "__call__" or not name.startswith("_")}
