@@ -1,6 +1,4 @@
-"""Settings dataclasses from YAML, by their schema. What a file leaves out keeps its default.
-
-Schema of settings dataclasses, shared by reading, writing and documenting them.
+"""Settings dataclasses from YAML, by a schema that reading, writing and documenting them share.
 
 | type hint of the field                  | schema     | in YAML                                                     |
 |-----------------------------------------|------------|-------------------------------------------------------------|
@@ -17,7 +15,7 @@ and looked up where it is used.
 
 The kind of a dataclass is its attribute `kind` if it has one, else its name in snake case without "Settings".
 
-YAML to settings dataclasses. What a file leaves out keeps its default.
+What a file leaves out keeps its default.
 
 * A section overrides field by field, a table (`Mapping`) entry by entry: an entry the defaults lack starts from the
   table's entry `default` where there is one, and `null` takes an entry away. A list replaces the default list.

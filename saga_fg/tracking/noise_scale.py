@@ -29,8 +29,7 @@ import numpy as np
 
 from saga_fg.model.sensor import NoiseModel, Sensor, sensor_model
 from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.assignment import Matching
-from saga_fg.numerics.gating import chi_square_quantile
+from saga_fg.numerics.assignment import Matching, gate, mahalanobis_of_pairs
 from saga_fg.tracking.measurements import FrameMeasurements
 
 ORDERS = (1, 2, 3)
@@ -86,6 +85,9 @@ class SensorNoise:
         return SensorNoise(_scale(squares), False, start, self.seen + seen, needed, tuple(squares))
 
 
+UNMEASURED = SensorNoise()
+
+
 def _apart(frames: Sequence[_Detections]) -> list[_Detections]:
     """The newest frame and those before it that are `STEP` and more from one another, as many as are compared."""
     found = [frames[-1]]
@@ -102,14 +104,14 @@ def _squares(time: FloatArray, position: FloatArray, R: FloatArray) -> FloatArra
     c = 1 / apart.prod(axis=1)
     c = c / np.sqrt((c**2).sum())
     D = np.einsum("k,knj->nj", c, position)
-    return np.asarray(np.einsum("nj,nj->n", D, np.linalg.solve(R, D[:, :, None])[:, :, 0]))
+    return mahalanobis_of_pairs(D, R)[0]
 
 
 def _scale(squares: list[FloatArray]) -> float:
     known = [each for each in squares if len(each) >= FEWEST]
     if not known:
         return 1.0
-    variance = min(float(np.quantile(each, QUANTILE)) for each in known) / chi_square_quantile(QUANTILE, 2)
+    variance = min(float(np.quantile(each, QUANTILE)) for each in known) / gate(QUANTILE)
     count = max(len(each) for each in known)
     s = math.exp(math.log(max(variance, 1e-12)) / 2 * count / (count + PRIOR))
     trust = min(max((s - SHARED[0]) / (SHARED[1] - SHARED[0]), 0.0), 1.0)

@@ -35,7 +35,7 @@ from saga_fg.tracking.initiation import initiate_tracks
 from saga_fg.tracking.journal import Observer, Stage, TrackerView
 from saga_fg.tracking.map_nodes import MapNodes
 from saga_fg.tracking.measurements import frame_measurements
-from saga_fg.tracking.noise_scale import SensorNoise, for_gates, observed, with_scale
+from saga_fg.tracking.noise_scale import UNMEASURED, for_gates, observed, with_scale
 from saga_fg.tracking.prediction import judge_edges, look_ahead, predict
 from saga_fg.tracking.relinking import hand_over
 from saga_fg.tracking.reporting import delete_tracks, report_tracks
@@ -186,7 +186,7 @@ class Tracker:
         self._notify("predict", state, frame.sensor)
 
         measurements = frame_measurements(frame, sensor, self.settings.classes, state.confused)
-        by_model, noise = measurements, state.noise.get(frame.sensor, SensorNoise())
+        by_model, noise = measurements, state.noise.get(frame.sensor, UNMEASURED)
         if sensor.calibrate_noise:
             measurements = with_scale(measurements, noise)
         measurements = measurements.with_context(delay, state.ego.relative_positions(measurements, frame))
@@ -200,7 +200,7 @@ class Tracker:
         matching, rivals = associate(state, gated)
         self._notify("associate", state, frame.sensor, measurements, matching)
 
-        if sensor.calibrate_noise and delay == 0:
+        if sensor.calibrate_noise and not noise.settled and delay == 0:
             noise = observed(noise, by_model, matching, state.table.id[matching.track], state.time)
             state.noise = {**state.noise, frame.sensor: noise}
         if delay == 0:

@@ -14,11 +14,10 @@ end of a drive as at its beginning.
 The measurements themselves are kept. `finish` chooses the loops that agree (`select_loops`), and solves everything
 together, nothing condensed, from the running estimate.
 
-Association of observations with the landmarks of the running submap.
-
-Pose and landmarks of the submap are one Gaussian in the frame of its anchor (`LocalMap`), so that a submap far from the
-start is associated as the first one. Walls and lines are finite: two pieces farther apart along the wall than `_GAP`
-are not of one, though in one plane, as the fronts of houses in a row are.
+Observations are associated with the landmarks of the running submap. Pose and landmarks of the submap are one Gaussian
+in the frame of its anchor (`LocalMap`), so that a submap far from the start is associated as the first one. Walls and
+lines are finite: two pieces farther apart along the wall than `_GAP` are not of one, though in one plane, as the fronts
+of houses in a row are.
 """
 
 from __future__ import annotations
