@@ -58,8 +58,9 @@ class RecordingOptions:
         str | None,
         typer.Option(
             "--sets",
-            help="Of megvii, centerpoint, camera, kitti, simulated; confused (classes); with made detections ngsim, "
-            "openacc, dut, crossings (simulated, without signals), eth_ucy and crowds (simulated).  "
+            help="Of megvii, centerpoint, camera, kitti, simulated; either LiDAR on the camera's scene, alone and with "
+            "it: megvii_alone, megvii_fused, centerpoint_alone, centerpoint_fused; confused (classes); with made "
+            "detections ngsim, openacc, dut, crossings (simulated, without signals), eth_ucy and crowds (simulated).  "
             "[default: the first five]",
         ),
     ] = None
@@ -112,9 +113,10 @@ class RecordingSet:
         return list(found.values())
 
 
-def _nuscenes(name: str, split: str, sensor: str, file: str, data: Path) -> RecordingSet:
+def _nuscenes(name: str, split: str, files: Mapping[str, str], data: Path) -> RecordingSet:
+    """nuScenes with the detections of each sensor from its file."""
     root = data / "nuscenes"
-    detections = {sensor: root / "detections" / file}
+    detections = {sensor: root / "detections" / file for sensor, file in files.items()}
     dataset = NuScenes(root, VERSION, detections, split_scenes(root, VERSION, split), ground_truth=True)
 
     def score(runs: Runs) -> Score:
@@ -220,8 +222,8 @@ def recording_set(
         return _sensed(name, simulated_crossings(scenes).middle(longest), viewpoint or ABOVE)
     if data is None:
         raise InputError(f"set {name}: expected --data DIR with the folders of recordings")
-    if name in SETS:
-        return SETS[name](data)
+    if name in SETS | FUSION_SETS:
+        return (SETS | FUSION_SETS)[name](data)
     if name == "eth_ucy":
         return _crowded(name, recorded_crowds(data / name).middle(longest), viewpoint)
     traffic, usual = TRAFFIC_SETS[name]
@@ -261,7 +263,11 @@ def chosen_sets(
     Raises `InputError` for a recording that no set has, and for options of recorded traffic without it.
     """
     wanted = (
-        chosen("--sets", sets, (*SETS, *TRAFFIC_SETS, "eth_ucy", "simulated", "confused", "crowds", "crossings"))
+        chosen(
+            "--sets",
+            sets,
+            (*SETS, *FUSION_SETS, *TRAFFIC_SETS, "eth_ucy", "simulated", "confused", "crowds", "crossings"),
+        )
         if sets
         else (*(SETS if data is not None else ()), "simulated")
     )
@@ -277,11 +283,19 @@ def chosen_sets(
     return [replace(one, dataset=ChosenScenes(one.dataset, ",".join(some))) for one, some in mine if some]
 
 
+_MEGVII, _CENTERPOINT = {"lidar": "megvii_lidar.json"}, {"lidar": "centerpoint_lidar.json"}
+_CAMERA = {"camera": "fastbev_camera.json"}
 SETS: dict[str, Callable[[Path], RecordingSet]] = {
-    "megvii": partial(_nuscenes, "megvii", "mini_train", "lidar", "megvii_lidar.json"),
-    "centerpoint": partial(_nuscenes, "centerpoint", "lidar_centerpoint", "lidar", "centerpoint_lidar.json"),
-    "camera": partial(_nuscenes, "camera", "camera", "camera", "fastbev_camera.json"),
+    "megvii": partial(_nuscenes, "megvii", "mini_train", _MEGVII),
+    "centerpoint": partial(_nuscenes, "centerpoint", "lidar_centerpoint", _CENTERPOINT),
+    "camera": partial(_nuscenes, "camera", "camera", _CAMERA),
     "kitti": _kitti,
+}
+FUSION_SETS: dict[str, Callable[[Path], RecordingSet]] = {
+    "megvii_alone": partial(_nuscenes, "megvii alone", "camera", _MEGVII),
+    "megvii_fused": partial(_nuscenes, "megvii and camera", "camera", _MEGVII | _CAMERA),
+    "centerpoint_alone": partial(_nuscenes, "centerpoint alone", "camera", _CENTERPOINT),
+    "centerpoint_fused": partial(_nuscenes, "centerpoint and camera", "camera", _CENTERPOINT | _CAMERA),
 }
 TRAFFIC_SETS: dict[str, tuple[Callable[[Path], Recordings], str]] = {
     "ngsim": (ngsim_windows, MAST),

@@ -193,7 +193,9 @@ class Sensor(Settings):
         None, "area over which false detections spread, m^2; null: that of `tracker.association`"
     )
     initiation: Literal["alone", "confirmed"] = setting(
-        "alone", "new tracks count at once (alone), or after three detections or another sensor (confirmed)"
+        "alone",
+        "new tracks count at once (alone), or (confirmed) once another sensor has detected them, and after three "
+        "detections where no sensor of the first kind looks",
     )
     field_of_view: FieldOfView = settings_group(FieldOfView, "where the sensor can detect")
     extrinsics: Extrinsics = settings_group(Extrinsics, "pose on the vehicle, for detections in sensor coordinates")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import Matching
 from saga_fg.tracking.measurements import FrameMeasurements
@@ -35,7 +34,7 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
     relative = None if measurements.relative is None else measurements.relative.select(rows)
     state.joint.add(ids, boxes.label, kinematics, delay, relative, appended=True)
     update_range_rates(state, measurements, rows, ids, boxes.label, np.ones(k))
-    time = state.time - delay
+    time, alone = state.time - delay, measurements.sensor.initiation == "alone"
     z_noise, yaw_noise = measurements.z_noise[rows], measurements.yaw_noise[rows]
     new = TrackTable(
         ids,
@@ -50,7 +49,8 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
         last_detected=np.full(k, time),
         confirmed=(p >= state.settings.existence.confirm_above) & (unresolved == 0),
         has_moved=np.zeros(k, dtype=bool),
-        required_hits=np.full(k, required_hits(state, measurements.sensor)),
+        required_hits=np.full(k, float(state.settings.min_hits if alone else CONFIRMING)),
+        overlooked=np.full(k, np.nan if alone else -np.inf),
         unresolved=unresolved,
         class_belief=state.confused.initial(measurements.class_likelihood[rows]),
         box=BoxFilter.initiated(boxes.size, p, boxes.position[:, 2], z_noise, boxes.yaw, yaw_noise),
@@ -60,11 +60,6 @@ def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matchi
     )
     state.table = state.table.append(new)
     return rows
-
-
-def required_hits(state: TrackerState, sensor: Sensor) -> float:
-    """Detections of a sensor alone that confirm a track which it has initiated."""
-    return float(state.settings.min_hits if sensor.initiation == "alone" else CONFIRMING)
 
 
 def initial_kinematics(

@@ -58,7 +58,7 @@ def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
     score = reported_score(table, rows, coasting > 0, settings.existence)
     score = score * state.confused.certainty(state.class_belief()[rows])
     if settings.tentative_score_factor < 1:
-        score = np.where(table.tentative[rows], settings.tentative_score_factor * score, score)
+        score = np.where(table.tentative(state.time)[rows], settings.tentative_score_factor * score, score)
     columns = {"label": table.label[rows], "position": centre, "size": table.box.size.take(rows, 0)}
     boxes = unchecked(Boxes, **_frozen(columns | {"yaw": yaw, "velocity": now.velocity}))
     columns = {"id": table.id[rows], "score": score, "coasting": coasting}
@@ -80,7 +80,7 @@ def reported_rows(state: TrackerState) -> IntArray:
     coasting = table.coasting(state.time)
     chosen = table.confirmed | (table.seen_existence >= settings.existence.report_above)
     if settings.tentative_score_factor == 0:
-        chosen &= ~table.tentative
+        chosen &= ~table.tentative(state.time)
     in_view = (table.sensors.seen_by_any() > 0) | settings.report_out_of_view
     chosen &= (coasting == 0) | ((coasting <= settings.report_coasting) & in_view & known_places(state))
     return chosen.nonzero()[0]

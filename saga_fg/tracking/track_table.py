@@ -126,6 +126,11 @@ class SensorEvidence(Columns):
         p = 1 / (1 + np.exp(-np.clip(logit, -LARGEST_LOGIT, LARGEST_LOGIT)))
         return np.where((recent & self.detected).any(axis=1), p, np.nan)
 
+    def overlooked_by(self, sensor: str, missed: BoolArray) -> BoolArray:
+        """(n,) which of the `missed` tracks (n,) the sensor has in view, and has never detected."""
+        at = self._column(sensor)
+        return np.asarray(missed & (self.visibility[:, at] > 0) & (self.hits[:, at] == 0))
+
     def detected_by_others(self, sensor: str, now: float, memory: float) -> BoolArray:
         """(n,) which tracks another sensor has detected in the last `memory` s."""
         at = self._column(sensor)
@@ -185,6 +190,8 @@ class TrackTable(Columns):
     confirmed         (n,) whether misses no longer delete it
     has_moved         (n,) whether it was ever clearly in motion
     required_hits     (n,) detections after which it is no longer tentative, if they are of one sensor
+    overlooked        (n,) time at which a sensor whose tracks count at once last had it in view and had never detected
+                      it; NaN for those that such a sensor has initiated
     unresolved        (n,) further frames to tell it from the track that it overlaps, see `saga_fg.tracking.unresolved`
     class_belief      (n, C) log-probabilities by its detections, see `saga_fg.tracking.class_belief`
     box               size, height and heading
@@ -206,6 +213,7 @@ class TrackTable(Columns):
     confirmed: BoolArray
     has_moved: BoolArray
     required_hits: FloatArray
+    overlooked: FloatArray
     unresolved: FloatArray
     class_belief: FloatArray
     box: BoxFilter
@@ -231,6 +239,7 @@ class TrackTable(Columns):
             confirmed=no,
             has_moved=no,
             required_hits=none,
+            overlooked=none,
             unresolved=none,
             class_belief=np.empty((0, classes)),
             box=BoxFilter.empty(),
@@ -243,10 +252,12 @@ class TrackTable(Columns):
         """Rows (k,) of tracks that are in the table."""
         return np.searchsorted(self.id, ids)  # ids count up
 
-    @property
-    def tentative(self) -> BoolArray:
-        """(n,) tracks that may be no object of their own: of too few detections, or unresolved."""
-        return np.asarray((self.unresolved > 0) | ~self.sensors.confirmed(self.required_hits))
+    def tentative(self, now: float) -> BoolArray:
+        """(n,) tracks that may be no object of their own: unresolved, of too few detections, or of one sensor where
+        a better one has lately seen nothing."""
+        overlooked = now - self.overlooked <= MEMORY
+        required = np.where(overlooked, np.inf, self.required_hits)
+        return np.asarray((self.unresolved > 0) | ~self.sensors.confirmed(required))
 
     @property
     def seen_existence(self) -> FloatArray:

@@ -197,6 +197,9 @@ def update_existence(state: TrackerState, measurements: FrameMeasurements, match
     time, t, d = state.time - measurements.delay, matching.track, matching.detection
     missed = np.ones(len(table), dtype=bool)
     missed[t] = False
+    if measurements.sensor.initiation == "alone" and measurements.viewpoint is not None:
+        overlooked = table.sensors.overlooked_by(measurements.name, missed) & ~np.isnan(table.overlooked)
+        table.overlooked[overlooked] = time
     p_detect = measurements.sensor.detection_chance(table.label)
     p_seen = p_detect * table.sensors.seen_by(measurements.name)
     # a track that another sensor has just detected exists, whether this one misses it or not

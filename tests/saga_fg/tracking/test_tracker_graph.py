@@ -18,7 +18,7 @@ from saga_fg import (
 )
 from saga_fg.model.edge_rules import Following, Neighbours, Pairs
 from saga_fg.model.interactions import SharedVelocity
-from saga_fg.model.sensor import NoiseModel
+from saga_fg.model.sensor import FieldOfView, NoiseModel
 from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings
 from tests.saga_fg.traffic_frames import assert_estimators_agree, assert_same, columns, frame, run, seen, straight
 
@@ -319,6 +319,20 @@ def test_a_weak_sensor_needs_repeated_evidence_or_another_sensor():
     frames = [frame(0.0, (10.0, 0.0), "camera"), frame(0.05, (10.0, 0.0), "lidar"), frame(0.1, (10.0, 0.0), "camera")]
     assert [t.id.tolist() for t in run(tracker, frames)] == [[], [1], [1]]
     assert len(Tracker(independent(), WEAK).step(frame(0.0, (10.0, 0.0), "lidar"))) == 1
+
+
+def test_what_a_better_sensor_overlooks_counts_only_while_that_does_not_look():
+    narrow, here = Sensor(field_of_view=FieldOfView(max_range=30.0)), {"world_T_ego": np.eye(4)}
+    for place, counts in (((10.0, 0.0), False), ((40.0, 0.0), True)):
+        tracker = Tracker(independent(), {**WEAK, "lidar": narrow})
+        times = TENTHS[:10]
+        both = [f for t in times for f in (frame(t, [], **here), frame(t + 0.01, place, "camera", **here))]
+        assert bool(len(run(tracker, both)[-1])) == counts, place
+        silent = [frame(t, place, "camera", **here) for t in np.arange(1.0, 5.0, 0.1)]
+        assert len(run(tracker, silent)[-1]) == 1, "nobody else has looked for long"
+    tracker = Tracker(independent(), WEAK)
+    assert len(run(tracker, [frame(0.0, [], **here), frame(0.01, (10.0, 0.0), "camera", **here)])[-1]) == 0
+    assert len(tracker.step(frame(0.1, (10.0, 0.0), **here))) == 1, "the other sensor confirms it"
 
 
 def test_what_two_sensors_see_scores_higher_than_what_one_of_them_misses():
