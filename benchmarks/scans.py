@@ -169,15 +169,11 @@ def _to_boxes(box: Boxes, origin: FloatArray, direction: FloatArray) -> FloatArr
 
 
 SENSOR_HEIGHT = 1.8  # m above the ground
-CURB = 6.4  # m, from the middle of the road to its edge
 SMALL = ScannerSettings(rings=24, columns=360)
 
 
-def street(seed: int = 0, curbs: bool = False) -> StaticWorld:
-    """Houses of different depth along a street on the x axis, 16 m wide, and across its end.
-
-    curbs: raised pavements on both sides, `CURB` m from the middle of the road
-    """
+def street(seed: int = 0) -> StaticWorld:
+    """Houses of different depth along a street on the x axis, 16 m wide, and across its end."""
     rng = np.random.default_rng(seed)
     label, position, size = [], [], []
     for side in (-1.0, 1.0):
@@ -195,10 +191,6 @@ def street(seed: int = 0, curbs: bool = False) -> StaticWorld:
     label.append("house")
     position.append((120.0, 0.0, 3.0))
     size.append((6.0, 60.0, 6.0))
-    for side in (-1.0, 1.0) if curbs else ():
-        label.append("pavement")
-        position.append((25.0, side * (CURB + 0.75), 0.075))
-        size.append((170.0, 1.5, 0.15))
     poles = np.array([[x, side * 7.0, 0.15, 5.0] for side in (-1, 1) for x in np.arange(-30.0, 80.0, 17.0) + 4 * side])
     n = len(label)
     return StaticWorld(Boxes.of(label, position, size, np.zeros(n), np.zeros((n, 2))), poles)
@@ -231,7 +223,6 @@ class SimulatedScans:
     """Scans of a drive along the street of a seed: `data_tools.lidar.scan.ScanSequence` with the true poses.
 
     world_T_lidar  (K, 4, 4), K >= 2, true poses; None for a drive of `count` scans
-    curbs          pavements with curbs on both sides
     world          in place of the street
     """
 
@@ -241,13 +232,12 @@ class SimulatedScans:
         count: int = 60,
         world_T_lidar: FloatArray | None = None,
         settings: ScannerSettings = SMALL,
-        curbs: bool = False,
         world: StaticWorld | None = None,
     ) -> None:
         self.world_T_ego: FloatArray = drive(count, period=settings.period) if world_T_lidar is None else world_T_lidar
         self.timestamps: FloatArray = settings.period * np.arange(len(self.world_T_ego), dtype=np.float64)
         self.ego_T_lidar: FloatArray = np.eye(4)
-        self.world = street(seed, curbs) if world is None else world
+        self.world = street(seed) if world is None else world
         self._scans = scans(self.world, self.world_T_ego, seed, settings)
 
     def __len__(self) -> int:

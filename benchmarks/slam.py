@@ -31,10 +31,11 @@ from scipy.spatial import cKDTree
 from benchmarks.agreement import pairwise_agreement
 from benchmarks.course import SimulatedCourse
 from benchmarks.landmark_mapper import LandmarkMapper
+from benchmarks.map_sharpness import scan_to_map_residual
 from benchmarks.runner import Row, Rows, Seed, clocked, each, in_turn, timed
 from benchmarks.scans import ScannerSettings
 from data_tools.datasets.kitti import kitti_scans
-from data_tools.lidar import Scan, constant_velocity, deskewed, scan_to_map_residual
+from data_tools.lidar import Scan, constant_velocity, deskewed
 from data_tools.lidar.scan import ScanSequence
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.slam.lidar_slam import LidarSlam

@@ -93,7 +93,7 @@ def main() -> None:
         paths["joint"] = joint.world_T_ego[:, :3, 3]
         last = np.array([path[-1] for path in confirmed_paths(joint).values()])
         write_bytes(HERE / "joint_above.png", png(paths_from_above(paths, {"objects": last})))
-        scans = SimulatedScans(seed=0, count=40, curbs=True)
+        scans = SimulatedScans(seed=0, count=40)
         write_lidar_slam(Path(folder) / "slam", lidar_slam(scans), scans)
         shutil.copy(Path(folder) / "slam" / "above.png", HERE / "slam_above.png")
         log, _ = laser_drive(seed=0)

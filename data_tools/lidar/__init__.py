@@ -1,4 +1,4 @@
-"""LiDAR geometry: scans from files, de-skew, thinning, registration, ground, walls, poles, curbs.
+"""LiDAR geometry: scans from files, de-skew, thinning, registration, ground, walls, poles.
 
 Points are arrays (N, 3) in m. Unless a function says otherwise they are in the sensor's frame: x ahead, y left, z up.
 Open3D is imported when a PCD or PLY file is read.

@@ -1,16 +1,13 @@
 from .landmarks import (
     Ground,
-    Line,
     Plane,
     Pole,
-    extract_curbs,
     extract_poles,
     extract_walls,
     fit_plane,
     segment_ground,
-    straight_lines,
 )
-from .places import Submap, scan_to_map_residual, upright
+from .places import Submap, upright
 from .registration import (
     Observability,
     Registration,
@@ -26,7 +23,6 @@ from .scan_files import read_scan, write_cloud
 
 __all__ = [
     "Ground",
-    "Line",
     "Observability",
     "Plane",
     "Pole",
@@ -39,16 +35,13 @@ __all__ = [
     "azimuth_times",
     "constant_velocity",
     "deskewed",
-    "extract_curbs",
     "extract_poles",
     "extract_walls",
     "fit_plane",
     "observability",
     "read_scan",
     "register",
-    "scan_to_map_residual",
     "segment_ground",
-    "straight_lines",
     "surfels_of",
     "upright",
     "voxel_downsample",

@@ -267,8 +267,6 @@ def scans(
         typer.echo(f"{what} against the recording: ATE {e['ate']:.3f} m, {relative}, end {e['end_error']:.3f} m")
     for span in figures["degenerate"]:
         typer.echo(f"scans {span['first']} to {span['last']} leave open: {', '.join(span['motions'])}")
-    if np.isfinite(figures["scan_to_map_residual"]):
-        typer.echo(f"mean scan-to-map residual: {1e3 * figures['scan_to_map_residual']:.1f} mm")
     if recording.dropped:
         typer.echo(
             f"points without a place: {sum(recording.dropped.values())} in {counted(len(recording.dropped), 'scan')}"

@@ -35,8 +35,8 @@ from scipy.special import ndtr
 from data_tools.lidar import Scan, Submap, voxel_downsample
 from data_tools.lidar.scan import inside_boxes, without_objects
 from data_tools.trajectories import Trajectory
-from pipelines.slam.loop_closures import ClosedSubmaps, SubmapLoops
-from pipelines.slam.odometry import Drive, LidarOdometry, Odometry, OdometryStep, checked_step, moved_pose
+from pipelines.slam.loop_closures import ClosedSubmaps, LoopSearch
+from pipelines.slam.odometry import Drive, Odometry, OdometryStep, moved_pose
 from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from pipelines.slam.vehicle_sensors import Vehicle, VehicleSensors
 from saga_fg.errors import InputError
@@ -205,7 +205,7 @@ class FrontEnd:
     odometry: Odometry
     submaps: SubmapSettings
     spacing: float
-    loops: SubmapLoops | None
+    loops: LoopSearch | None
     observe: Callable[[FloatArray], Sequence[Observation]]
 
 
@@ -281,17 +281,12 @@ class Slam:
             self._moving.check(scan, detections)
             moving = self._moving.boxes(time, detections, self._path.expected(time) if len(self._path) else self._start)
             scan = without_objects(scan, moving)
-        velocity = self._sensors.velocity(self._sensors.corrected(wheels))
-        if isinstance(self._odometry, LidarOdometry):
-            placed = self._odometry.step(scan, time, velocity)
-        else:
-            placed = checked_step(self._odometry.step(scan, time))
+        placed = self._sensors.placed(self._odometry, scan, time, measured)
         if not self._path.keyframes:
             placed = replace(placed, keyframe=True)
         self._degenerate.append(placed.degenerate)
         self._boxes.append(moving)
         self._path.add(time, self._start @ placed.map_T_lidar, placed)
-        self._measured.add(time, self._sensors.compared(measured, placed))
         self._online.append(self._path.poses[-1])
         row, submap, known = len(self._path) - 1, None, len(self._closed.loops)
         if placed.keyframe:

@@ -2,12 +2,7 @@
 
 Each scan that has moved is registered with a map of the last keyframes, point to line; the wheels are its prior.
 
-Poses by the wheels, without implausible steps, and the scale of the wheels.
-
-Along a bare corridor odometry alone tells the way, and wheels of another size than the robot believes err by some per
-cent. The scale k is estimated from the steps s that registration determines, as x ahead:
-
-    s_registered = k s_wheels + noise of variance v,        k ~ N(1, 0.05^2)
+Poses by the wheels, without implausible steps.
 
 Loops: keyframes of a closed submap are searched for in older submaps, by branch and bound.
 
@@ -30,6 +25,7 @@ from data_tools.laser.mapping import SMEAR, Fit, LineMap, ScoreGrid, thinned
 from data_tools.lidar import Scan, Submap
 from pipelines.slam.loop_closures import Agreement, LoopSearch
 from pipelines.slam.odometry import OdometryStep, motion
+from pipelines.slam.vehicle_sensors import WheelScale
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import (
@@ -49,10 +45,6 @@ from saga_fg.slam.submaps import LoopClosure
 from saga_fg.slam.submaps.loops import Motion
 
 _SLACK = 1.0  # m that a step of the wheels may be longer than the largest speed allows: logs come in bursts
-_SCALE = 0.05  # standard deviation of the scale of wheels
-_STEP_NOISE = 0.02  # m, of a step that registration determines: it errs with the map
-_KNOWN_SCALE = 0.005  # standard deviation at which the scale is as good as known
-_BELIEVED = 0.3  # share of a step by which registration may differ: beyond, wheels slipped, or it erred
 _STILL, _CHANGED, _MANY = 1e-6, 0.3, 0.3  # m of the wheels; m of a reading, and the share of a scan, that show motion
 _log = logging.getLogger(__name__)
 
@@ -108,39 +100,6 @@ def check_wheels(log: LaserLog) -> None:
             f"scan {moved + 1}: {100 * changed[moved]:.0f} % of the readings differ from those of the first scan, but "
             "the wheels stand still throughout: expected odometry"
         )
-
-
-@dataclass(eq=False)
-class WheelScale:
-    """Ratio of ways driven to those that the wheels tell, from steps that registration determines."""
-
-    _information: float = _SCALE**-2
-    _weighted: float = _SCALE**-2
-
-    @property
-    def value(self) -> float:
-        """The estimate of k."""
-        return self._weighted / self._information
-
-    @property
-    def known(self) -> bool:
-        """True if more steps hardly change it."""
-        return self._information > _KNOWN_SCALE**-2
-
-    def corrected(self, step: FloatArray) -> FloatArray:
-        """A step (3, 3) of the wheels in true metres."""
-        scaled = step.copy()
-        scaled[:2, 2] *= self.value
-        return scaled
-
-    def update(self, predicted: FloatArray, registered: FloatArray, covariance: FloatArray) -> None:
-        """Take a corrected step of the wheels and that by registration (3, 3), with the covariance of the latter."""
-        wheels, driven = float(predicted[0, 2]) / self.value, float(registered[0, 2])
-        if abs(driven - predicted[0, 2]) > _BELIEVED * abs(predicted[0, 2]):
-            return
-        weight = 1 / (float(covariance[0, 0]) + _STEP_NOISE**2)
-        self._information += weight * wheels**2
-        self._weighted += weight * wheels * driven
 
 
 _FLOOR = np.array([0.01, 0.01, 0.002]) ** 2  # variance of a registration of any number of points, m^2 and rad^2
@@ -256,12 +215,12 @@ class LaserOdometry:
         self._grid: ScoreGrid | None = None
         self._since = 0  # scans since the last keyframe
 
-    def step(self, scan: Scan, timestamp: float) -> OdometryStep:
+    def step(self, scan: Scan, timestamp: float, velocity: FloatArray | None = None) -> OdometryStep:
         """Place the next scan."""
         points, first = scan.points[:, :2], not self.keyframes
         if first:
             self._last = self._at_keyframe = self.wheels
-        rolled = self.scale.corrected(np.linalg.inv(self._last) @ self.wheels)
+        rolled = self._rolled(self._last)
         at, way, turn = self._at @ rolled, float(np.hypot(rolled[0, 2], rolled[1, 2])), abs(heading(rolled))
         sigma = np.array([0.02 + ODOMETRY_DRIFT * way] * 2 + [0.01 + ODOMETRY_TURN * (turn + way / 2)])
         covariance, keyframe, lost = np.diag(sigma**2), first, 0
@@ -270,7 +229,8 @@ class LaserOdometry:
             if self._map is not None:
                 fit = self._registered(self._map, points, at, np.diag(sigma**-2.0), way, turn)
                 before, at = self._at, transform(fit.pose)
-                self.scale.update(rolled, np.linalg.inv(before) @ at, covariance_of(fit.information / SMEAR, at))
+                driven, P = np.linalg.inv(before) @ at, covariance_of(fit.information / SMEAR, at)
+                self.scale.update(float(rolled[0, 2]), float(driven[0, 2]), float(P[0, 0]))
                 covariance = self._doubted(covariance_of(fit.information / SMEAR + np.diag(sigma**-2.0), at), at)
                 lost = self._since
             since = np.linalg.inv(self.keyframes[-1].matched) @ at if self.keyframes else np.eye(3)
@@ -283,6 +243,12 @@ class LaserOdometry:
         self._since = 0 if keyframe else self._since + 1
         P = np.zeros((6, 6)) if first else covariance_in_space(covariance)
         return OdometryStep(timestamp, in_space(at), P, scan, keyframe, None, lost=lost)
+
+    def _rolled(self, since: FloatArray) -> FloatArray:
+        """The motion (3, 3) by the wheels, in true metres, since they were at a pose (3, 3)."""
+        step = np.linalg.inv(since) @ self.wheels
+        step[:2, 2] *= self.scale.value
+        return np.asarray(step)
 
     def _registered(
         self, local: LineMap, points: FloatArray, predicted: FloatArray, prior: FloatArray, way: float, turn: float
@@ -302,8 +268,7 @@ class LaserOdometry:
     def _doubted(self, covariance: FloatArray, at: FloatArray) -> FloatArray:
         """The covariance of the motion since the last keyframe, larger where the wheels say otherwise."""
         since = np.linalg.inv(self.keyframes[-1].matched) @ at
-        rolled = self.scale.corrected(np.linalg.inv(self._at_keyframe) @ self.wheels)
-        off = vector(np.linalg.inv(since) @ rolled)
+        off = vector(np.linalg.inv(since) @ self._rolled(self._at_keyframe))
         doubt = _DOUBT * np.array([np.hypot(off[0], off[1])] * 2 + [abs(off[2])])
         doubt[2] += _TURNING * abs(heading(since))
         return np.asarray(covariance + np.diag(doubt**2))

@@ -23,7 +23,6 @@ from pipelines.slam.laser_odometry import (
     LaserLoops,
     LaserOdometry,
     LaserSettings,
-    WheelScale,
     check_wheels,
     joined,
     level_scan,
@@ -31,6 +30,7 @@ from pipelines.slam.laser_odometry import (
     warn_of_times,
     without_jumps,
 )
+from pipelines.slam.vehicle_sensors import WheelScale
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked

@@ -1,6 +1,6 @@
 """SLAM with a LiDAR: the front end of `pipelines.slam.driver` for it, and whole recordings, with objects too.
 
-Scans are registered with the surfels of those before; walls, curbs and poles are observed at keyframes; submaps that
+Scans are registered with the surfels of those before; walls and poles are observed at keyframes; submaps that
 look alike from above are proved by registration. Odometry is that of the LiDAR, or the recording's own poses, for
 comparison and for objects alone.
 
@@ -21,21 +21,21 @@ from typing import Literal
 
 import numpy as np
 
-from data_tools.lidar import extract_curbs, extract_poles, extract_walls, segment_ground, straight_lines
+from data_tools.lidar import extract_poles, extract_walls, segment_ground
 from data_tools.lidar.recording import scan_context
 from data_tools.lidar.scan import ScanSequence
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
 from pipelines.slam.driver import FrontEnd, MovingObjects, Slam, SlamResult
-from pipelines.slam.loop_closures import LoopSettings, PlaceLoops, SubmapLoops
+from pipelines.slam.loop_closures import LoopSearch, LoopSettings, PlaceLoops
 from pipelines.slam.odometry import LidarOdometry, Odometry, OdometrySettings, RecordedOdometry
 from pipelines.slam.submaps import CloudFormat, world_T_submap
 from pipelines.slam.vehicle_sensors import Vehicle, start_by_fixes
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.model.landmarks import LandmarkDetector, LineLandmark, PlaneLandmark, PoleLandmark
+from saga_fg.model.landmarks import LandmarkDetector, PlaneLandmark, PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
@@ -50,7 +50,6 @@ from saga_fg.types.landmark import Observation
 
 WALL = PlaneLandmark(name="wall")
 POLE = PoleLandmark()
-LINE = LineLandmark()
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,6 @@ class ScanLandmarkSettings:
 
     walls: int = setting(6, "largest number of walls of a scan; the largest ones are kept")
     poles: int = setting(12, "largest number of poles of a scan; the nearest ones are kept")
-    lines: int = setting(2, "largest number of curb lines of a scan; those with the most points are kept")
 
 
 def observe_landmarks(
@@ -79,9 +77,6 @@ def observe_landmarks(
     for pole in sorted(poles, key=lambda pole: float(np.hypot(*pole.foot[:2])))[: s.poles]:
         extent = np.stack([pole.foot, [*pole.foot[:2], pole.top]])
         found.append(Observation(POLE, pole.foot, pole.covariance, extent))
-    curbs = extract_curbs(points, ground.height) if s.lines else np.empty((0, 3))
-    for line in straight_lines(curbs, s.lines):
-        found.append(Observation(LINE, line.ends.ravel(), line.covariance, line.ends))
     return found + [other for detector in detectors for other in detector.observations(points)]
 
 
@@ -140,7 +135,7 @@ class LidarSlam(Slam):
         *,
         providers: Sequence[FactorProvider] = (),
         detectors: Sequence[LandmarkDetector] = (),
-        loops: SubmapLoops | None = None,
+        loops: LoopSearch | None = None,
         odometry: Odometry | None = None,
         moving: MovingObjects | None = None,
         vehicle: Vehicle | None = None,

@@ -226,8 +226,7 @@ class Localiser:
         self._path.check(scan, time)
         measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
         self._measured.check(measured)
-        placed = self._odometry.step(scan, time, self._sensors.velocity(self._sensors.corrected(wheels)))
-        self._measured.add(time, self._sensors.compared(measured, placed))
+        placed = self._sensors.placed(self._odometry, scan, time, measured)
         self._path.add(time, placed.map_T_lidar, placed)
         row = len(self._path) - 1
         if gps is not None:

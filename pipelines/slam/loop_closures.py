@@ -35,7 +35,6 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -177,7 +176,7 @@ class _Proved:
 
 
 class LoopSearch(ABC):
-    """Submaps in, loops out: `SubmapLoops`, where `found` says which older submaps show the place of a new one.
+    """Submaps in, loops out: `found` says which older submaps show the place of a new one.
 
     min_path: m of way between two submaps that are compared; waiting: loops that need another one
     """
@@ -322,20 +321,10 @@ def _off(frames: FloatArray, loop: LoopClosure) -> float:
 _LOG = logging.getLogger(__name__)
 
 
-class SubmapLoops(Protocol):
-    """Keeps what it needs of the submaps: descriptors, points."""
-
-    def add(self, submap: Submap, world_T_submap: FloatArray) -> Sequence[LoopClosure]:
-        """Take the next submap and return loops, `first` and `second` numbers of submaps.
-
-        world_T_submap: (number + 1, 4, 4) frames of all submaps so far, as estimated now, this one's last
-        """
-
-
 class ClosedSubmaps:
     """The submaps of a drive so far; search: for loops between them, None for none."""
 
-    def __init__(self, search: SubmapLoops | None) -> None:
+    def __init__(self, search: LoopSearch | None) -> None:
         self.submaps, self.loops = list[Submap](), list[LoopClosure]()  # loops are between keyframes
         self._search = search
 

@@ -21,7 +21,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -36,13 +36,12 @@ from data_tools.lidar import (
     register,
     voxel_downsample,
 )
-from data_tools.lidar.scan import ScanSequence, without_objects
+from data_tools.lidar.scan import ScanSequence
 from data_tools.trajectories import rotation_angle
 from saga_fg.errors import InputError, require_type
 from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform, transform_points
 from saga_fg.settings import Positive, Settings, setting
-from saga_fg.types.boxes import Boxes
 
 _FIRST_DEVIATION = 1.0  # standard deviation of the first motion, m
 _DEVIATION_FLOOR = 0.1  # least standard deviation of the prediction, m; higher: a wider search for pairs
@@ -417,8 +416,8 @@ class Odometry(Protocol):
     One with an attribute `registers` that is True registers scans with each other, so that they show things straight.
     """
 
-    def step(self, scan: Scan, timestamp: float) -> OdometryStep:
-        """Place the next scan."""
+    def step(self, scan: Scan, timestamp: float, velocity: FloatArray | None = None) -> OdometryStep:
+        """Place the next scan; velocity: by other sensors, as of `LidarOdometry.step`."""
 
 
 class RecordedOdometry:
@@ -431,7 +430,7 @@ class RecordedOdometry:
         self._noise = np.diag([rotation] * 3 + [translation] * 3) ** 2
         self._row, self._keyframe = -1, 0
 
-    def step(self, scan: Scan, timestamp: float) -> OdometryStep:
+    def step(self, scan: Scan, timestamp: float, velocity: FloatArray | None = None) -> OdometryStep:
         """Place the next scan of the recording; raises `InputError` for one of another time."""
         k, s = self._row + 1, self._settings
         if k == len(self._times) or timestamp != self._times[k]:
@@ -453,21 +452,3 @@ def deskewed_in_range(
         return scan
     duration = float(timestamps[before + 1] - timestamps[before])
     return deskewed(scan, constant_velocity(inverse_transform(poses[before]) @ poses[before + 1], duration))
-
-
-class KeyframeClouds(Sequence[FloatArray]):
-    """Points (N, 3) of keyframes in the frame of the sensor, without skew by `drive`, read from the recording again.
-
-    moving: (K) boxes of moving objects in the frame of each scan, which are left out
-    """
-
-    def __init__(self, scans: ScanSequence, drive: Drive, settings: OdometrySettings, moving: Sequence[Boxes]) -> None:
-        self._scans, self._drive, self._settings, self._moving = scans, drive, settings, moving
-
-    def __len__(self) -> int:
-        return len(self._drive.keyframes)
-
-    def __getitem__(self, k: Any) -> Any:
-        row = self._drive.keyframes[k]
-        scan = without_objects(self._scans[row], self._moving[row])
-        return deskewed_in_range(scan, row, self._drive.poses, self._scans.timestamps, self._settings).points

@@ -31,8 +31,8 @@ observations.csv            keyframe, landmark, kind, value, covariance: all obs
 landmarks.json              each landmark; landmarks.csv: the same as a table, with shapes as WKT
 tracks.csv                  objects, where there are any
 above.png                   map, paths, landmarks and the objects' tracks from above
-metrics.json                errors of the trajectories against the recording's own poses, the map's sharpness, scans
-                            that left motions open, and sensors that do not fit or measured too little to tell
+metrics.json                errors of the trajectories against the recording's own poses, scans that left motions
+                            open, and sensors that do not fit or measured too little to tell
 
 Files of points and landmarks are left out where there are none.
 
@@ -56,16 +56,15 @@ import numpy as np
 from data_tools.figures import write_figures
 from data_tools.files.atomic_files import atomic_directory, write_bytes, write_text
 from data_tools.laser import LaserLog, OccupancyGrid
-from data_tools.lidar import scan_to_map_residual, write_cloud
+from data_tools.lidar import write_cloud
 from data_tools.lidar.scan import ScanSequence
 from data_tools.plots import occupancy_picture, paths_from_above, png, scan_map_from_above
 from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.slam.driver import SlamResult
 from pipelines.slam.laser_slam import LaserPath
-from pipelines.slam.lidar_slam import LINE, WALL, LidarSlamSettings
+from pipelines.slam.lidar_slam import WALL, LidarSlamSettings
 from pipelines.slam.localisation import LocalisedDrive
-from pipelines.slam.odometry import KeyframeClouds, OdometrySettings
 from pipelines.slam.submaps import Origin, SlamMap, placed_clouds, write_map
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import in_space, inverse_transform, transform_points, transforms
@@ -219,14 +218,10 @@ _GAP = 2.0  # m between observed spans of a wall, beyond which two pieces of it 
 _MOVES, _TELLING = 1.0, 10.0  # m/s; m of way that tell where ahead is
 _ONE_WAY, _SIDEWAYS = 0.9, 20.0  # length of the mean direction; deg off the axis
 _log = logging.getLogger(__name__)
-_LINED = (WALL.name, LINE.name)
 
 
-def metrics(result: SlamResult, scans: ScanSequence, odometry: OdometrySettings | None = None) -> dict[str, Any]:
-    """Errors (start aligned) of the three trajectories against the recording's poses, if it has any; residuals, counts.
-
-    odometry: settings of the run
-    """
+def metrics(result: SlamResult, scans: ScanSequence) -> dict[str, Any]:
+    """Errors (start aligned) of the three trajectories against the recording's poses, if it has any; counts."""
     truth = reference(scans)
     paths = {name: getattr(result, name) for name in ("odometry", "online", "trajectory")}
     paths["without_objects"], kinds = result.alone, [landmark.kind.name for landmark in result.landmarks]
@@ -240,7 +235,6 @@ def metrics(result: SlamResult, scans: ScanSequence, odometry: OdometrySettings 
         "degenerate": degenerate_spans(result.trajectory.timestamps, result.degenerate),
         "misfits": {**result.misfits, **_misplaced(result.trajectory)},
         "unjudged": dict(result.unjudged),
-        "scan_to_map_residual": _residual(result, scans, odometry or OdometrySettings()),
         **{
             name: asdict(trajectory_errors(path, truth, "start"))
             for name, path in paths.items()
@@ -285,14 +279,6 @@ def degenerate_spans(times: FloatArray, degenerate: Sequence[tuple[str, ...]]) -
     return spans
 
 
-def _residual(result: SlamResult, scans: ScanSequence, odometry: OdometrySettings) -> float:
-    """Mean scan-to-map residual, m, of some forty keyframes at most, whose scans are read again; NaN without points."""
-    if not any(len(submap.points) for submap in result.submaps):
-        return float("nan")
-    clouds = KeyframeClouds(scans, result.drive, odometry, result.moving)
-    return scan_to_map_residual(clouds, result.world_T_lidar, every=max(5, len(clouds) // 40))
-
-
 def write_lidar_slam(
     output: Path,
     result: SlamResult,
@@ -307,7 +293,7 @@ def write_lidar_slam(
     s = settings or LidarSlamSettings()
     clouds, objects = [submap.points for submap in result.submaps], result.objects
     points, lines = placed_clouds(clouds, result.world_T_submap, s.map_spacing), _lines(result)
-    figures, truth = metrics(result, scans, s.odometry), reference(scans)
+    figures, truth = metrics(result, scans), reference(scans)
     if objects is not None:
         figures["objects"] = len(object_paths(objects))
     with atomic_directory(output, known=LIDAR_FILES) as folder:
@@ -328,7 +314,8 @@ def write_lidar_slam(
         if objects is not None:
             write_objects(folder / "tracks.csv", objects)
         driven = () if objects is None else tuple(confirmed_paths(objects).values())
-        figure = scan_map_from_above(points, paths, _poles(result.landmarks), _by_kind(lines, result.landmarks), driven)
+        walls = {"walls": np.concatenate([np.empty((0, 2, 2)), *lines.values()])}
+        figure = scan_map_from_above(points, paths, _poles(result.landmarks), walls, driven)
         write_bytes(folder / "above.png", png(figure))
         write_figures(folder / "metrics.json", figures)
     return figures
@@ -343,25 +330,18 @@ def write_paths(folder: Path, trajectory: Trajectory, **others: Trajectory | Non
 
 
 def _lines(result: SlamResult) -> dict[int, FloatArray]:
-    """Ends (n, 2, 2), from above, of the pieces of each wall and road line that were observed."""
-    return {mark.number: _seen_pieces(result, mark) for mark in result.landmarks if mark.kind.name in _LINED}
-
-
-def _by_kind(lines: Mapping[int, FloatArray], landmarks: Sequence[Landmark]) -> dict[str, FloatArray]:
-    """Pieces (W, 2, 2) of walls and of road lines."""
-    kinds = {"walls": WALL.name, "road lines": LINE.name}
-    found = {name: [lines[mark.number] for mark in landmarks if mark.kind.name == kind] for name, kind in kinds.items()}
-    return {name: np.concatenate([np.empty((0, 2, 2)), *ends]) for name, ends in found.items()}
+    """Ends (n, 2, 2), from above, of the pieces of each wall that were observed."""
+    return {mark.number: _seen_pieces(result, mark) for mark in result.landmarks if mark.kind == WALL}
 
 
 def _poles(landmarks: Sequence[Landmark]) -> FloatArray:
-    """Places (P, 2) of all but walls and lines."""
-    places = [mark.kind.coordinates(mark.state) for mark in landmarks if mark.kind not in (LINE, WALL)]
+    """Places (P, 2) of all but walls."""
+    places = [mark.kind.coordinates(mark.state) for mark in landmarks if mark.kind != WALL]
     return np.array([[place["x"], place["y"]] for place in places], dtype=np.float64).reshape(-1, 2)
 
 
 def _seen_pieces(result: SlamResult, mark: Landmark) -> FloatArray:
-    """Ends (n, 2, 2) of the pieces of a wall or road line that were observed."""
+    """Ends (n, 2, 2) of the pieces of a wall that were observed."""
     place = mark.kind.coordinates(mark.state)
     normal = np.array([place["nx"], place["ny"]]) / np.hypot(place["nx"], place["ny"])
     along = np.array([-normal[1], normal[0]])
@@ -390,7 +370,7 @@ def covered_spans(spans: Sequence[tuple[float, float]]) -> list[tuple[float, flo
 def write_landmark_table(path: Path, landmarks: Iterable[Landmark], pieces: Mapping[int, FloatArray]) -> None:
     """Write number, kind, observations, standard deviations of the state, and the geometry as WKT, in x and y, m.
 
-    pieces: (n, 2, 2) ends of what was seen of walls and lines, by the number of the landmark; others are points
+    pieces: (n, 2, 2) ends of what was seen of walls, by the number of the landmark; others are points
     """
     rows = ["number,kind,observations,deviations,geometry"]
     for mark in landmarks:

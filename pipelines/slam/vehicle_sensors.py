@@ -1,11 +1,13 @@
 """The vehicle's sensors beside its LiDAR: joined between keyframes, wheels compared with scans.
 
-Comparison of the wheels' speed with the motion by scans, once, over the first way on which scans show the motion.
+Wheels of another size than the vehicle believes err by some per cent. Their scale k is estimated from the steps s that
+registration determines, as x ahead:
 
-The ratio k of both is the median over scans, with deviation 1.25 s / sqrt(n), s by the median absolute deviation. Until
-then speeds enter the graph only where scans leave motions open. Within `_SURE` deviations of 1, that of k and the
-`share` of the settings together, wheels are taken as they are. Beyond, the speed is divided by k from then on; it is
-left out if k changes too much, or is none that radius or calibration of wheels explain.
+    s_registered = k s_wheels + noise of variance v,        k ~ N(1, 0.05^2)
+
+Until k is known, speeds enter the graph only where scans leave motions open; from then on they are multiplied by it.
+A warning says where it is off 1 by more than `_SURE` deviations, that of k and the `share` of the settings together.
+Wheels whose steps are far from those of the scans are left out.
 """
 
 from __future__ import annotations
@@ -17,9 +19,10 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
+from data_tools.lidar import Scan
 from data_tools.lidar.recording import scan_context
 from data_tools.lidar.scan import ScanSequence
-from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep
+from pipelines.slam.odometry import LidarOdometry, Odometry, OdometrySettings, OdometryStep, checked_step
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.numerics.arrays import FloatArray
@@ -89,67 +92,92 @@ class BetweenKeyframes:
         return WheelSpeed(float(share @ [one.speed for one in wheels]), float(dt.sum()), deviation)
 
 
-_WAY, _LEAST = 15.0, 15  # m and scans that are compared
+_SCALE = 0.05  # standard deviation of the scale of wheels
+_STEP_NOISE = 0.02  # m, of a step that registration determines: it errs with the map
+_KNOWN_SCALE = 0.005  # standard deviation at which the scale is as good as known
+_BELIEVED = 0.3  # share of a step by which registration may differ: beyond, wheels slipped, or it erred
+
+
+@dataclass(eq=False)
+class WheelScale:
+    """Ratio of ways driven to those that the wheels tell, from steps that registration determines.
+
+    refused: steps of which the two differ too much to compare them
+    """
+
+    refused: int = 0
+    _information: float = _SCALE**-2
+    _weighted: float = _SCALE**-2
+
+    @property
+    def value(self) -> float:
+        """The estimate of k."""
+        return self._weighted / self._information
+
+    @property
+    def known(self) -> bool:
+        """True if more steps hardly change it."""
+        return self._information > _KNOWN_SCALE**-2
+
+    def update(self, predicted: float, driven: float, variance: float) -> None:
+        """Take a step ahead of the wheels, in true metres so far, and that by registration, m, with its variance."""
+        if abs(driven - predicted) > _BELIEVED * abs(predicted):
+            self.refused += 1
+            return
+        wheels, weight = predicted / self.value, 1 / (variance + _STEP_NOISE**2)
+        self._information += weight * wheels**2
+        self._weighted += weight * wheels * driven
+
+
 _MOVING = 1.0  # m/s from which a speed tells a scale
 _SURE = 3.0  # deviations
-_SCALES, _SPREAD = (0.75, 1.33), 0.1  # of wheels that are scaled, and the largest s of theirs
+_REFUSED = 15  # steps that scans contradict, after which wheels are left out
 
 
 class WheelComparison:
-    """Takes each speed before its scan is placed (`corrected`), and the scan after (`used`, `update`).
+    """Takes each speed before its scan is placed (`corrected`), and the scan after (`compared`).
 
-    settings: of the wheels; ego_T_lidar: (4, 4) pose of the LiDAR on the vehicle
+    settings: of the wheels; ego_T_lidar: (4, 4) pose of the LiDAR on the vehicle; scale: of the wheels
     """
 
     def __init__(self, settings: Wheels, ego_T_lidar: FloatArray) -> None:
-        self._settings = settings
+        self._settings, self.scale = settings, WheelScale()
         self._lidar_T_axle = inverse_transform(ego_T_lidar) @ mounting("mounted", settings.mounted).matrix()
-        self._scale: float | None = 1.0  # None: left out
-        self._raw: WheelSpeed | None = None
-        self._used: WheelSpeed | None = None
         self._last: OdometryStep | None = None
-        self._ratios, self._way, self._judged = list[float](), 0.0, settings.estimate_scale
+        self._judged = False
 
     def corrected(self, wheels: WheelSpeed | None) -> WheelSpeed | None:
         """The speed to use; None if wheels are left out."""
-        self._raw = self._used = wheels
-        if wheels is not None and self._scale != 1:
-            self._used = None if self._scale is None else replace(wheels, speed=self._scale * wheels.speed)
-        return self._used
+        if wheels is None or (self._judged and not self.scale.known):
+            return None
+        return replace(wheels, speed=self.scale.value * wheels.speed) if self._judged else wheels
 
-    def used(self, step: OdometryStep) -> WheelSpeed | None:
-        """The speed that enters the graph with a scan that was placed."""
+    def compared(self, wheels: WheelSpeed | None, step: OdometryStep) -> tuple[WheelSpeed | None, str]:
+        """The speed that enters the graph with a scan that was placed, and once, in words, what does not fit."""
         shown = step.registration is not None and not step.degenerate
-        return self._used if self._judged or not shown else None
-
-    def update(self, step: OdometryStep) -> str:
-        """Compare the last speed with the motion to a scan; returns once what does not fit, in words."""
-        last, self._last = self._last, step if step.registration is not None and not step.degenerate else None
-        if self._judged or self._raw is None or last is None or self._last is None:
-            return ""
+        used = self.corrected(wheels) if self._judged or not shown else None
+        last, self._last = self._last, step if shown else None
+        if self._judged or wheels is None or last is None or not shown:
+            return used, ""
         dt = step.timestamp - last.timestamp
         moved = inverse_transform(last.map_T_lidar @ self._lidar_T_axle) @ step.map_T_lidar @ self._lidar_T_axle
-        speed = float(gtsam.Pose3.Logmap(gtsam.Pose3(moved))[3]) / dt
-        if abs(speed) < _MOVING or abs(self._raw.dt - dt) > dt / 2:
-            return ""
-        self._ratios.append(self._raw.speed / speed)
-        self._way += abs(speed) * dt
-        return self._judged_misfit() if self._way >= _WAY and len(self._ratios) >= _LEAST else ""
+        driven = float(gtsam.Pose3.Logmap(gtsam.Pose3(moved))[3])
+        if abs(driven) >= _MOVING * dt and abs(wheels.dt - dt) <= dt / 2:
+            variance = (dt * self._settings.deviation) ** 2
+            self.scale.update(self.scale.value * wheels.speed * dt, driven, variance)
+            self._judged = self.scale.known or self.scale.refused >= _REFUSED
+        return used, self._misfit() if self._judged else ""
 
-    def _judged_misfit(self) -> str:
-        ratio = float(np.median(self._ratios))
-        spread = 1.4826 * float(np.median(np.abs(np.array(self._ratios) - ratio)))
-        deviation = np.hypot(self._settings.share, 1.25 * spread / np.sqrt(len(self._ratios)))
-        self._judged = True
-        allowed = _SURE * deviation
+    def _misfit(self) -> str:
+        name, ratio = self._settings.name, 1 / self.scale.value
+        if not self.scale.known:
+            return f"{name}: {self.scale.refused} times their speed is far from that by the scans; they are left out"
+        allowed = _SURE * float(np.hypot(self._settings.share, _KNOWN_SCALE))
         if abs(ratio - 1) <= allowed:
             return ""
-        scaled = 1 / ratio if _SCALES[0] <= ratio <= _SCALES[1] and spread <= _SPREAD else None
-        self._scale = scaled
-        then = "they are left out from here on" if scaled is None else f"it is multiplied by {scaled:.3f} from here on"
         return (
-            f"{self._settings.name}: over the first {self._way:.0f} m their speed is {ratio:.3f} times that by the "
-            f"scans, where its settings and the spread of the ratio allow {allowed:.1%} off; {then}"
+            f"{name}: their speed is {ratio:.3f} times that by the scans, where its settings allow {allowed:.1%} off; "
+            f"it is multiplied by {self.scale.value:.3f} from here on"
         )
 
 
@@ -188,25 +216,24 @@ class VehicleSensors:
         """Fresh providers of their factors."""
         return sensor_providers(self._settings, self.names, self.lidar_T_ego)
 
-    def corrected(self, wheels: WheelSpeed | None) -> WheelSpeed | None:
-        """The speed of the wheels that predicts the next scan's motion; scaled or None if scans contradict it."""
-        return self._wheels.corrected(wheels) if "wheels" in self.names else wheels
-
-    def compared(self, measured: EgoMeasurements, step: OdometryStep) -> EgoMeasurements:
-        """What was measured until a scan that was placed, with the speed of the wheels that the graph takes.
+    def placed(self, odometry: Odometry, scan: Scan, time: float, measured: EgoMeasurements) -> OdometryStep:
+        """Place the next scan, taken at `time`, s, by an odometry; what was measured since waits for a keyframe.
 
         Warns once if wheels do not fit the scans.
         """
-        if "wheels" not in self.names:
-            return measured
-        wheels, misfit = self._wheels.used(step), self._wheels.update(step)
-        if misfit:
-            self.consistency.state("wheels", misfit)
-        return replace(measured, wheels=wheels)
+        wheels = measured.wheels if "wheels" in self.names else None
+        step = checked_step(odometry.step(scan, time, self._velocity(self._wheels.corrected(wheels))))
+        if "wheels" in self.names:
+            used, misfit = self._wheels.compared(wheels, step)
+            measured = replace(measured, wheels=used)
+            if misfit:
+                self.consistency.state("wheels", misfit)
+        self.since_keyframe.add(time, measured)
+        return step
 
-    def velocity(self, wheels: WheelSpeed | None) -> FloatArray | None:
+    def _velocity(self, wheels: WheelSpeed | None) -> FloatArray | None:
         """The velocity (6,) of the LiDAR by the wheels, as `LidarOdometry.step` takes it; None without them."""
-        if wheels is None or "wheels" not in self.names:
+        if wheels is None:
             return None
         return np.concatenate([np.full(3, np.nan), self.ego_T_lidar[:3, :3].T @ [wheels.speed, 0.0, 0.0]])
 

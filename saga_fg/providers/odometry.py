@@ -9,10 +9,9 @@ motion's logarithm times the share, its covariance as well. Without an increment
 
 The speed of the vehicle by its wheels: they roll ahead, and slide neither sideways nor off the ground.
 
-    r = log( X^-1 before^-1 now X )_translation / dt - s (v, 0, 0)
+    r = log( X^-1 before^-1 now X )_translation / dt - (v, 0, 0)
 
-X is the place of the axle that does not steer, v the mean speed by the wheels and s their scale: 1, or a variable for
-all time.
+X is the place of the axle that does not steer, v the mean speed by the wheels.
 """
 
 from __future__ import annotations
@@ -29,18 +28,14 @@ from factors import (
     Pose,
     Robust,
     SpatialPose,
-    Variable,
-    Vector,
     between_factor,
     pose,
     pose_prior_factor,
-    prior_factor,
     residual_factor,
 )
 from saga_fg.errors import InputError
-from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.providers import Additions, GraphView
-from saga_fg.graph.variables import EGO_CALIBRATION, EGO_POSE, NewVariable
+from saga_fg.graph.variables import EGO_POSE, NewVariable
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_of, yaw_transform
 from saga_fg.settings import Fraction, Positive, Settings, setting, settings_group
@@ -160,7 +155,7 @@ def _motion_of(reported: OdometryIncrement, planar: bool) -> Pose:
 
 Mounting = tuple[float, float, float, float, float, float]
 ON_THE_POSE: Mounting = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-ANTENNA, WHEELS, INERTIAL = range(3)  # ids of calibrations
+ANTENNA, INERTIAL = range(2)  # ids of calibrations
 Provider = TypeVar("Provider")
 
 
@@ -190,7 +185,6 @@ def on_pose(provider: Provider, pose_T_vehicle: FloatArray) -> Provider:
 
 _OFF = 0.5  # share of an epoch that the wheels must have measured
 SIDEWAYS = 0.1  # standard deviation of the velocity to the side and upwards, m/s
-SCALE_DEVIATION = 0.05  # standard deviation of the scale of the speed beforehand, as a share
 
 
 @dataclass(frozen=True)
@@ -207,7 +201,6 @@ class Wheels(Settings):
     mounted: Mounting = setting(
         ON_THE_POSE, "x, y, z (m), roll, pitch, yaw (rad) of the axle that does not steer, in the vehicle's frame"
     )
-    estimate_scale: bool = setting(False, "true: the scale of the speed is a variable of the graph")
     name = "wheels"
 
     def __post_init__(self) -> None:
@@ -229,21 +222,14 @@ class Wheels(Settings):
             raise InputError("wheels: expected the vehicle's pose in space, got one in the plane")
         ahead = np.hypot(self.deviation if wheels.deviation is None else wheels.deviation, self.share * wheels.speed)
         R = np.diag(np.square([ahead, SIDEWAYS, SIDEWAYS]))
-        keys, types = [before.key, now.key], list[Variable]([SpatialPose(), SpatialPose()])
-        new, priors = list[NewVariable](), list[Factor]()
-        if self.estimate_scale:
-            scale = view.key(EGO_CALIBRATION, WHEELS, static=True)
-            keys, types = [*keys, scale], [*types, Vector(1)]
-            if WHEELS not in view.static(EGO_CALIBRATION):
-                new.append(NewVariable(EGO_CALIBRATION, WHEELS, np.ones(1), static=True, label="scale of the wheels"))
-                priors.append(prior_factor(scale, np.ones(1), [[SCALE_DEVIATION**2]]))
         residual = partial(_residual, self._place, view.dt, wheels.speed)
         robust = Robust("cauchy", self.outlier_scale)
+        keys, types = [before.key, now.key], [SpatialPose(), SpatialPose()]
         factor = residual_factor(keys, types, residual, R, robust=robust, name="speed of the wheels")
-        return Additions(new, [*priors, factor])
+        return Additions(factors=[factor])
 
 
-def _residual(place: gtsam.Pose3, dt: float, speed: float, before: Any, now: Any, *scale: FloatArray) -> FloatArray:
+def _residual(place: gtsam.Pose3, dt: float, speed: float, before: Any, now: Any) -> FloatArray:
     moved = gtsam.Pose3.Logmap(before.compose(place).between(now.compose(place)))[3:] / dt
-    moved[0] -= speed * (float(scale[0][0]) if scale else 1.0)
+    moved[0] -= speed
     return np.asarray(moved)

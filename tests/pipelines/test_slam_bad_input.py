@@ -42,7 +42,7 @@ class Given:
     def __init__(self, steps: Sequence[object]) -> None:
         self.steps = iter(steps)
 
-    def step(self, scan: Scan, timestamp: float) -> OdometryStep:
+    def step(self, scan: Scan, timestamp: float, velocity: np.ndarray | None = None) -> OdometryStep:
         return next(self.steps)  # type: ignore[return-value]
 
 

@@ -17,12 +17,10 @@ from pipelines.slam.loop_closures import Agreement, PlaceLoops, deviation
 from pipelines.slam.odometry import (
     LOST_ROTATION,
     LOST_TRANSLATION,
-    KeyframeClouds,
     LidarOdometry,
     OdometrySettings,
     OdometryStep,
 )
-from pipelines.slam.results import metrics
 from saga_fg import Boxes, Detections, Frame
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -164,9 +162,6 @@ def test_the_trail_of_a_moving_car_is_not_in_the_map():
     settings = LidarSlamSettings(loop_closures=False, landmarks=False)
     before = lidar_slam(scans, "lidar", settings=settings)
     after = lidar_slam(scans, "lidar", settings=settings, objects=(frames, path_tracker(load_config("kitti"))))
-    clouds = [KeyframeClouds(scans, one.drive, settings.odometry, one.moving) for one in (before, after)]
-    assert len(clouds[1][-1]) < len(clouds[0][-1]) - 20
-    assert metrics(after, scans)["scan_to_map_residual"] < metrics(before, scans)["scan_to_map_residual"]
     assert points_on(before, places[5:]) > 200
     assert points_on(after, places[5:]) < 0.05 * points_on(before, places[5:])
     parked = scans.world.boxes.select(scans.world.boxes.label == "car").position

@@ -76,7 +76,7 @@ def test_wheels_of_another_scale_are_named_at_once_and_corrected(
     assert 15 < named[0] < 30
     result = slam.finish()
     assert re.search(said, result.misfits["wheels"])
-    assert caplog.text.count("times that by the scans") == 1
+    assert len(re.findall(said, caplog.text)) == 1
     off = np.linalg.norm(result.trajectory.positions - scans.world_T_ego[:, :3, 3], axis=1)
     assert off.max() < 0.2
 

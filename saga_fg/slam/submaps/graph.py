@@ -184,7 +184,7 @@ class SubmapSettings(Settings):
     )
     robust_scale: Positive = setting(
         3.0,
-        "residual from which losses discount poles and curbs (Geman-McClure) and loops (Cauchy, which pulls from far), "
+        "residual from which losses discount poles (Geman-McClure) and loops (Cauchy, which pulls from far), "
         "standard deviations",
     )
 

@@ -1,4 +1,4 @@
-"""Ground, walls, poles, curbs and objects, found in scans of a street whose every piece is known."""
+"""Ground, walls, poles and objects, found in scans of a street whose every piece is known."""
 
 from __future__ import annotations
 
@@ -7,19 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.scans import CURB, SENSOR_HEIGHT, ScannerSettings, StaticWorld, simulate_scan, street
+from benchmarks.scans import SENSOR_HEIGHT, ScannerSettings, StaticWorld, simulate_scan, street
 from data_tools.lidar import (
     Scan,
-    extract_curbs,
     extract_poles,
     extract_walls,
     fit_plane,
     segment_ground,
-    straight_lines,
 )
-from data_tools.lidar.landmarks import BIAS
 from data_tools.lidar.scan import clusters_from_above
-from saga_fg.numerics.geometry import transform_points, yaw_transform
+from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.boxes import Boxes
 
 FINE = ScannerSettings(rings=48, columns=1000)
@@ -109,47 +106,8 @@ def test_poles_are_found_where_they_stand() -> None:
     assert extract_poles(np.empty((0, 3)), np.empty(0)) == []
 
 
-def test_curbs_are_the_edges_of_the_road() -> None:
-    world = StaticWorld(
-        boxes((0.0, 8.0, 0.07, 80.0, 8.0, 0.14, 0.0), (0.0, -9.0, 0.07, 80.0, 8.0, 0.14, 0.0)), NO_POLES
-    )
-    points = seen(world).points
-    curbs = extract_curbs(points, segment_ground(points).height)
-    ahead = curbs[np.abs(curbs[:, 0]) < 6]
-    assert len(ahead) > 20
-    off = np.minimum(np.abs(ahead[:, 1] - 4.0), np.abs(ahead[:, 1] + 5.0))
-    assert np.mean(off < 0.4) > 0.9
-    flat = seen(StaticWorld(Boxes.empty(), NO_POLES)).points
-    assert len(extract_curbs(flat, segment_ground(flat).height)) == 0
-
-
 def test_parts_are_joined_across_cells_and_apart_beyond() -> None:
     chain = np.array([[0.1, 0.1, 0], [0.4, 0.4, 5], [0.7, 0.1, 0], [3.0, 0.1, 0], [-5.0, -5.0, 0]])
     clusters = clusters_from_above(chain, 0.3)
     assert sorted(rows.tolist() for rows in clusters) == [[0, 1, 2], [3], [4]]
     assert clusters_from_above(np.empty((0, 3)), 0.3) == []
-
-
-def test_straight_pieces_are_fitted_and_say_how_surely() -> None:
-    squares = []
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
-        points = np.column_stack([np.arange(-8.0, 9.0, 0.5), np.full(34, 4.0), np.full(34, -1.7)])
-        points[:, 1] += rng.normal(0, 0.1, 34) + np.interp(points[:, 0], [-8, 8.5], rng.normal(0, BIAS, 2))
-        stray = np.column_stack([rng.uniform(-8, 8, 12), rng.uniform(-10, 0, 12), np.full(12, -1.7)])
-        turn = yaw_transform(yaw=rng.uniform(-3, 3))
-        (edge, *_) = straight_lines(transform_points(turn, np.concatenate([points, stray])), 1)
-        off = transform_points(turn.T, edge.ends)[:, 1] - 4.0
-        squares.append(off @ np.linalg.solve(edge.covariance, off) / 2)
-    assert 0.5 < np.mean(squares) < 1.5
-    assert straight_lines(np.empty((0, 3)), 2) == []
-    assert straight_lines(np.random.default_rng(0).uniform(-20, 20, (12, 3)), 2) == []
-
-
-def test_curbs_of_a_simulated_street_are_straight_lines() -> None:
-    for seed in range(3):
-        points = seen(street(seed, curbs=True), seed).points
-        edges = straight_lines(extract_curbs(points, segment_ground(points).height), 2)
-        assert edges
-        for edge in edges:
-            np.testing.assert_allclose(np.abs(edge.ends[:, 1]), CURB, atol=0.35)

@@ -13,7 +13,7 @@ from saga_fg.estimators import BatchSolver, IncrementalSmoother
 from saga_fg.graph import EGO_BIAS, EGO_CALIBRATION, EGO_POSE
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.providers import Gps, Imu, StartSettings, Wheels
-from saga_fg.providers.odometry import ANTENNA, INERTIAL, WHEELS, mounting
+from saga_fg.providers.odometry import ANTENNA, INERTIAL, mounting
 from saga_fg.slam.mapping.mapper import MeasuredMotion
 from saga_fg.slam.sensors import SensorBuffer, SensorConsistency, SensorSettings, sensor_providers
 
@@ -196,13 +196,12 @@ def test_places_are_estimated_if_asked():
     asked = SensorSettings(
         replace(true.gps, antenna=(0.0, 0.0, 1.0), estimate_antenna=True),
         replace(IMU, estimate_rotation=True),
-        replace(SETTINGS.wheels, estimate_scale=True),
+        SETTINGS.wheels,
     )
     found = run(("gps", "imu", "wheels"), asked, true=true, batch=True)
     assert found.errors.max() < 0.5
     np.testing.assert_allclose(found.static(ANTENNA), [0.6, -0.4, 1.0], atol=0.25)
     np.testing.assert_allclose(found.static(INERTIAL), [0.02, -0.03, 0.05], atol=0.015)
-    np.testing.assert_allclose(found.static(WHEELS), [1.0], atol=0.01)
 
 
 def test_measurements_come_in_order_of_time():
