@@ -10,11 +10,9 @@ from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
 from data_tools.metrics import (
-    LabelErrors,
     SceneBoxes,
     calibration,
     error_summary,
-    errors_by_class,
     label_errors,
     label_velocities,
 )
@@ -97,14 +95,6 @@ def test_only_what_detections_match_counts_and_covariances_are_needed_for_calibr
     c = calibration(errors(DRIVE, DRIVE))
     assert c.boxes == 0
     assert math.isnan(c.anees)
-
-
-def test_pooled_scenes_have_objects_of_their_own():
-    e = errors(DRIVE, DRIVE, covariance=np.eye(2))
-    pooled = LabelErrors.pool([e, e])
-    assert len(pooled) == 10
-    assert calibration(pooled).objects == 2
-    assert set(errors_by_class(pooled)) == {"overall", "car"}
 
 
 def test_calibration_of_errors_drawn_from_the_covariance():

@@ -3,9 +3,7 @@
 import math
 import os
 import sys
-from collections.abc import Sequence
 from dataclasses import fields
-from itertools import count
 from typing import Any
 
 import numpy as np
@@ -15,7 +13,6 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
 from benchmarks.metrics import PYTHON_VARIABLE, differences, official_figures, parity, tracked_simulation
-from data_tools.datasets.nuscenes import NuScenes, ResultMeta, split_scenes, write_tracking_results
 from data_tools.datasets.nuscenes.source import read_scored_scenes
 from data_tools.metrics import (
     NuScenesClassMetrics,
@@ -25,7 +22,7 @@ from data_tools.metrics import (
     SceneBoxes,
     nuscenes_tracking_metrics,
 )
-from saga_fg import Annotations, Boxes, InputError, Tracks
+from saga_fg import Boxes, InputError
 from tests.data_tools.nuscenes_random_drive import VERSION, write_random_drive
 
 
@@ -51,39 +48,6 @@ def figures(truth, found, label="car", **options):
 
 
 CAR = [(k, "a", "car", 10.0 + k, 0.0) for k in range(4)]
-
-
-def test_counts_by_hand():
-    # The object is found at frames 1 and 3 by different tracks, 0.5 m off; a false alarm at frame 0.
-    found = [(0, "x", "car", 40.0, 0.0, 0.9), (1, "t", "car", 11.0, 0.5, 0.9), (3, "u", "car", 13.0, 0.5, 0.9)]
-    f = figures(CAR, found)
-    assert (f.gt, f.tp, f.fp, f.fn, f.ids, f.frag) == (4, 1, 1, 2, 1, 1)
-    assert f.motp == pytest.approx(0.5)
-    assert f.recall == pytest.approx(0.5)
-    assert f.mota == pytest.approx(0.0)
-    assert f.motar == 0.0  # 1 - (2 + 1 + 1 - 0.75 * 4) / 1
-    assert (f.mt, f.ml) == (0, 0)
-    assert f.faf == pytest.approx(25.0)
-    assert (f.tid, f.lgd) == (0.5, 0.5)
-    # One match that is no switch: recall 0.25 is reached, the 40 values up to 1 beyond it are not.
-    reached = np.sum(np.linspace(0.1, 1, 40) <= 0.25)
-    assert f.amota == 0.0
-    assert f.amotp == pytest.approx((reached * 0.5 + (40 - reached) * 2.0) / 40)
-
-
-def test_a_low_score_is_left_out_at_low_recall():
-    truth = [(k, name, "car", 10.0 * (1 + n), 0.0) for k in range(2) for n, name in enumerate("ab")]
-    found = [(k, name, "car", 10.0 * (1 + n), 0.0, 0.9 - 0.5 * n) for k in range(2) for n, name in enumerate("ab")]
-    found += [(k, "z", "car", 40.0, 0.0, 0.5) for k in range(2)]  # false, between the two in score
-    metrics = nuscenes_tracking_metrics([scene(truth, sorted(found))])
-    curve = metrics.curves["car"]
-    assert curve.hypothetical_recall[[0, -1]].tolist() == [1.0, 0.1]
-    assert set(curve.fp) == {0.0, 2.0}
-    assert (np.diff(curve.score) >= 0).all()
-    assert metrics.per_class["car"].mota == pytest.approx(
-        0.5
-    )  # 2 false alarms of 4, or 2 of 4 missed: high recall wins
-    assert metrics.per_class["car"].recall == 1.0
 
 
 def test_gaps_of_truth_and_tracks_are_filled_with_the_official_weights():
@@ -147,21 +111,6 @@ def test_classes_without_truth_do_not_count():
     nothing = nuscenes_tracking_metrics([scene([], [], frames=2)]).overall
     assert math.isnan(nothing.amota)
     assert nothing.gt == 0
-
-
-def test_tables_from_annotations_and_tracks():
-    boxes = Boxes.of(["car", "car"], [(1, 2, 0), (3, 4, 0)])
-    truth = SceneBoxes.of_annotations(
-        [Annotations(np.array(["a", "b"]), boxes, np.array([True, False]))] * 2, hidden=False
-    )
-    assert truth.id.tolist() == ["a", "a"]
-    assert truth.frame.tolist() == [0, 1]
-    covariance = np.tile(np.eye(2), (2, 1, 1))
-    tracks = Tracks(0.0, np.array([4, 5]), boxes, np.array([0.5, 0.7]), covariance, covariance, np.zeros(2))
-    found = SceneBoxes.of_tracks([tracks, Tracks.empty(1.0), tracks])
-    assert found.id.tolist() == ["4", "5", "4", "5"]
-    assert found.frame.tolist() == [0, 0, 2, 2]
-    assert len(SceneBoxes.of_tracks([])) == len(SceneBoxes.of_annotations([])) == 0
 
 
 def test_bad_tables_and_scenes(subtests):
@@ -350,38 +299,3 @@ def test_differences_and_kits_that_fail_are_found(tmp_path):
         official_figures(str(tmp_path / "python"), tmp_path, tmp_path, VERSION, "all")
     with pytest.raises(InputError, match=r"the development kit failed: .*Error"):
         official_figures(sys.executable, tmp_path, tmp_path, VERSION, "all")
-
-
-def test_a_recording(devkit, recordings, tmp_path):
-    root = recordings / "nuscenes"
-    names = split_scenes(root, VERSION, "camera")
-    dataset = NuScenes(root, VERSION, {}, names, ground_truth=True)
-    rng = np.random.default_rng(0)
-    scenes = [dataset.scene(name) for name in names]
-    tracked = [(scene, noisy_tracks(scene.ground_truth or [], rng)) for scene in scenes]
-    write_tracking_results(tmp_path / "result.json", tracked, ResultMeta(use_lidar=True))
-    ours = nuscenes_tracking_metrics(
-        [each.tracking for each in read_scored_scenes(tmp_path / "result.json", root, VERSION, names).values()]
-    )
-    assert ours.overall.ids > 0
-    assert_equal(ours, official_figures(devkit, tmp_path / "result.json", root, VERSION, "camera")[0])
-
-
-def noisy_tracks(truth: Sequence[Annotations], rng: np.random.Generator) -> list[Tracks]:
-    """The truth, shaken, a quarter of it missing, tracks broken now and then."""
-    numbers: dict[str, int] = {}
-    fresh = count()
-    frames = []
-    for k, frame in enumerate(truth):
-        rows = np.flatnonzero(rng.random(len(frame)) < 0.75)
-        names = frame.id[rows].tolist()
-        for name in names:
-            if name not in numbers or rng.random() < 0.05:
-                numbers[name] = next(fresh)
-        boxes, n = frame.boxes.select(rows), len(rows)
-        position = boxes.position + rng.normal(0, 0.4, (n, 3))
-        identity = np.array([numbers[name] for name in names], dtype=np.int64)
-        unknown = np.tile(np.eye(2), (n, 1, 1))
-        shaken = Boxes(boxes.label, position, boxes.size, boxes.yaw, boxes.velocity)
-        frames.append(Tracks(0.5 * k, identity, shaken, rng.random(n).round(1), unknown, unknown, np.zeros(n)))
-    return frames

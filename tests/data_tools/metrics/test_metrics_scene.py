@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from data_tools.metrics import (
-    ErrorSample,
     SceneMetrics,
-    coverage,
     match_scene,
     nees,
     scene_metrics,
@@ -51,16 +49,6 @@ def tracks(found, label="car", variance=1.0):
         np.tile(np.eye(2), (n, 1, 1)),
         np.zeros(n),
     )
-
-
-def test_perfect_tracks_have_no_errors():
-    gt = [truth({"A": (0, 0, 1, 0), "B": (5, 0, 1, 0)}), truth({"A": (1, 0, 1, 0), "B": (6, 0, 1, 0)})]
-    found = [tracks({7: (0, 0, 1, 0), 9: (5, 0, 1, 0)}), tracks({9: (6, 0, 1, 0), 7: (1, 0, 1, 0)})]
-    m = scene_metrics(gt, found)
-    assert (m.objects, m.matches, m.misses, m.false_positives, m.switches) == (4, 4, 0, 0, 0)
-    assert m.mota == m.recall == 1.0
-    assert m.position.rmse == m.velocity.rmse == m.motp == 0.0
-    assert m.heading.rmse == pytest.approx(0.2)
 
 
 def test_counts_by_hand():
@@ -167,24 +155,3 @@ def test_empty_scenes_and_moments_that_differ():
 
 
 # Consistency figures
-
-
-def test_nees_of_consistent_estimates_lies_in_its_band():
-    rng = np.random.default_rng(4)
-    L = rng.normal(size=(500, 2, 2))
-    covariance = L @ np.swapaxes(L, 1, 2) + 0.1 * np.eye(2)
-    error = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.normal(size=(500, 2)))
-    values = nees(error, covariance)
-    assert abs(values.mean() - 2) < 4 * np.sqrt(4 / 500)  # chi-squared with 2 degrees of freedom
-    assert nees(2 * error, covariance) == pytest.approx(4 * values)
-    for p in (0.5, 0.9, 0.99):
-        assert abs(coverage(values, p) - p) < 4 * np.sqrt(p * (1 - p) / 500)
-
-
-def test_error_samples_pool():
-    pooled = ErrorSample.pool([ErrorSample(np.array([3.0])), ErrorSample(np.empty(0)), ErrorSample(np.array([4.0]))])
-    assert len(pooled) == 2
-    assert pooled.rmse == pytest.approx(np.sqrt(12.5))
-    assert pooled.square_sums == (25.0, 2.0)
-    with pytest.raises(InputError):
-        ErrorSample(np.array([np.nan]))
