@@ -8,13 +8,12 @@ import pytest
 
 from data_tools.simulator import SimulatedTraffic, camera, lidar, road_users, simulate_scene
 from data_tools.simulator.road import curved_road
-from data_tools.simulator.road_users import SimulatedTrajectories, simulate_pedestrians, static_objects
+from data_tools.simulator.road_users import SimulatedTrajectories, simulate_pedestrians
 from data_tools.simulator.scene_layout import sample_layout
 from data_tools.simulator.sensed_world import recently_visible, without_short_runs
 from data_tools.simulator.settings import SensorSettings, SimulatorSettings, TrafficSettings
 from data_tools.simulator.world import World, build_world, simulate_traffic
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Dataset, Scene
 from saga_fg.types.frame import Frame
@@ -92,18 +91,6 @@ def test_traffic_merges_out_of_the_lane_that_ends_and_changes_its_offset_gradual
     assert changes >= 8
 
 
-def test_every_scene_has_queues_that_stop_and_go():
-    ranges = []
-    for seed in range(4):
-        rng = np.random.default_rng(seed)
-        scenario = sample_layout(SETTINGS, rng)
-        history = simulate_traffic(scenario, SETTINGS, rng)
-        near = (np.abs(history.s[0] - scenario.focus) < 120) & history.on_road[-1]
-        speed = history.speed[:, near]
-        ranges.append(float(np.median(speed.max(axis=0) - speed.min(axis=0))))
-    assert np.median(ranges) > 3.0  # m/s within 20 s
-
-
 def test_the_ego_vehicle_is_a_car_in_traffic_and_no_object():
     for seed in range(2):
         here = world(seed)
@@ -144,41 +131,6 @@ def test_people_walk_on_the_pavement_in_groups_that_sway_and_pause(monkeypatch):
     assert speed.min() < 0.1
     assert speed.max() > 0.9
     assert np.ptp(walkers.position[..., 0] - walkers.position[:, :1, 0], axis=0).max() < 1e-6
-
-
-def straight(position: FloatArray, velocity: FloatArray, time: FloatArray) -> SimulatedTrajectories:
-    shape = (len(time), 1)
-    return SimulatedTrajectories(
-        np.array(["a"]),
-        np.array(["car"]),
-        np.array([[4.0, 2.0, 1.5]]),
-        time,
-        position[:, None],
-        velocity[:, None],
-        np.zeros(shape),
-        np.ones(shape, dtype=np.bool_),
-    )
-
-
-def test_between_samples_motion_is_a_cubic():
-    time = np.array([1.0, 1.5, 2.0])
-
-    def place(t: FloatArray) -> FloatArray:
-        return np.stack([t**3 - t, 2 * t**2], axis=-1)
-
-    path = straight(place(time), np.stack([3 * time**2 - 1, 4 * time], axis=-1), time)
-    for t in (1.0, 1.2, 1.7, 2.0):
-        boxes, present = path.at(t)
-        assert boxes.position[0] == pytest.approx([*place(np.array(t)), 0.75])
-        assert present.all()
-
-
-def test_standing_objects_stand():
-    boxes = Boxes.of(["car"], [[5.0, 6.0, 0.8]], [[4.0, 2.0, 1.6]], [0.3], [[0.0, 0.0]])
-    found, present = static_objects(np.array(["x"]), boxes, np.array([0.0, 0.1, 0.2])).at(0.13)
-    assert found.position == pytest.approx(boxes.position)
-    assert found.velocity == pytest.approx(np.zeros((1, 2)))
-    assert present.all()
 
 
 def test_settings_no_world_can_have_are_refused(subtests):
@@ -252,30 +204,6 @@ def test_every_sensor_keeps_its_own_clock():
     slow = simulate_scene(replace(SHORT, keyframe_rate=2.0), 3)
     assert slow.timestamps - slow.timestamps[0] == pytest.approx(np.arange(8) / 2, abs=2e-6)
     assert slow.world_T_ego == pytest.approx(here.world_T_ego[::5], abs=1e-9)
-
-
-def test_detections_lie_near_true_objects_or_are_few():
-    here = scene(3)
-    world = build_world(SHORT, 3)
-    strays = 0
-    frames = [frame for frame in here.frames if frame.sensor == "lidar"]
-    for frame in frames:
-        truth, _ = world.objects.at(frame.timestamp - here.timestamps[0] + world.start)
-        place = frame.detections.boxes.position[:, :2]
-        away = np.linalg.norm(place[:, None] - truth.position[None, :, :2], axis=-1).min(axis=1)
-        strays += int((away > 1.5).sum())
-    assert 0.5 < strays / len(frames) < 4.0  # two false ones a frame
-
-
-def test_ground_truth_velocity_is_the_derivative_of_position():
-    truth = scene(3).ground_truth
-    assert truth is not None
-    for a, b, c in zip(truth[:-2], truth[1:-1], truth[2:], strict=True):
-        _, i, k = np.intersect1d(a.id, c.id, return_indices=True)
-        both, j, rows = np.intersect1d(b.id, a.id[i], return_indices=True)
-        difference = (c.boxes.position[k[rows]] - a.boxes.position[i[rows]])[:, :2] / 0.2
-        assert len(both) > 0
-        assert np.abs(difference - b.boxes.velocity[j]).max() < 0.8  # accelerations of up to 8 m/s^2
 
 
 def test_hidden_objects_were_in_view_not_long_ago():

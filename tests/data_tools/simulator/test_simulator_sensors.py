@@ -18,7 +18,7 @@ from data_tools.simulator.sensors import (
     range_drifts,
     sensor_position,
 )
-from data_tools.simulator.settings import SensorSettings, camera, far_camera, lidar, radar, sparse_lidar
+from data_tools.simulator.settings import SensorSettings, camera, lidar, radar
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.boxes import Boxes
@@ -143,15 +143,6 @@ def test_points_on_an_object_fall_with_the_square_of_the_distance():
     )
     n = points_on((0.01, 0.02), np.zeros(3), boxes, np.array([1.0, 0.5]))
     assert n == pytest.approx([1.8 * 1.6 / 20**2 / 2e-4, 0.5 * 4.5 * 1.6 / 40**2 / 2e-4])  # from behind, from the side
-
-
-def test_a_camera_sees_a_person_where_a_lidar_has_too_few_points():
-    boxes = Boxes.of(
-        ["pedestrian", "truck"], [[55.0, 0.0, 0.9], [55.0, 0.0, 1.8]], [[0.65, 0.65, 1.72], [8.0, 2.5, 3.4]], [0.0, 0.0]
-    )
-    person, truck = detection_probability(sparse_lidar(), np.zeros(3), boxes, np.ones(2))
-    assert person < 0.25 < 0.9 < truck
-    assert detection_probability(far_camera(), np.zeros(3), boxes, np.ones(2))[0] > 0.7
 
 
 def test_range_drifts_are_of_their_deviation_and_last_for_their_time():
