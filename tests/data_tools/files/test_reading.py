@@ -2,7 +2,6 @@
 
 import io
 import json
-import math
 import os
 import random
 import signal
@@ -13,7 +12,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sized
 from contextlib import suppress
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -79,14 +77,6 @@ def test_time_and_output_are_bounded(monkeypatch):
         records(readers.floods)
 
 
-def test_a_larger_file_may_take_longer(tmp_path):
-    (tmp_path / "a").write_bytes(bytes(10**6))
-    (tmp_path / "b").write_bytes(bytes(10**6))
-    assert isolated_reading._size(tmp_path / "a") == 10**6
-    assert isolated_reading._size(tmp_path) == 2 * 10**6
-    assert isolated_reading._size(tmp_path / "none") == 0
-
-
 @pytest.fixture
 def port() -> Iterator[int]:
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -127,14 +117,6 @@ def test_a_reader_that_nobody_waits_for_ends():
     del found  # which closes it
     with pytest.raises(ProcessLookupError):
         os.kill(child, 0)
-
-
-def test_a_child_whose_last_record_is_refused_serves_the_next_file(monkeypatch):
-    monkeypatch.setattr(isolated_reading, "ENDING", 60.0)
-    found = isolated(PROBLEM, readers.process, "a")
-    child = next(found)
-    del found
-    assert records(readers.process) == [child]
 
 
 PARENT = """
@@ -283,14 +265,6 @@ def test_object_read_in_pieces_equals_json_loads(content, piece):
     reader.end()
 
 
-def test_numbers_cut_by_a_piece_and_bare_nan_are_read(subtests):
-    for number, piece in product(["1.5e-7", "-12", "1e5", "123456", "0.25"], [1, 2, 3, 4, 5]):
-        with subtests.test(number=number, piece=piece):
-            assert list(stream(f"[{number} , {number}]", piece).array()) == [float(number)] * 2
-            assert stream(number, piece).value() == float(number)
-    assert str(list(stream("[NaN, -Infinity]", 2).array())) == "[nan, -inf]"
-
-
 @given(st.lists(values, min_size=1, max_size=4), st.data())
 def test_a_truncated_array_is_an_error(content, data):
     text = json.dumps(content)
@@ -308,16 +282,6 @@ def test_broken_arrays_and_objects_name_file_and_position(subtests):
             reader = stream(text)
             with pytest.raises(InputError, match=r"^x\.json: character \d+: "):
                 {key: reader.value() for key in reader.members()}
-
-
-def test_a_whole_number_no_float_can_hold_is_infinite(subtests):
-    for digits in [400, 4000, 5000]:
-        with subtests.test(digits=digits):
-            assert list(stream(f"[-{'9' * digits}, 7, 12345678901234567890]").array()) == [
-                -math.inf,
-                7,
-                12345678901234567890.0,
-            ]
 
 
 def test_what_is_no_json_is_named(tmp_path):
