@@ -13,16 +13,14 @@ from typer.testing import CliRunner
 from benchmarks import smoothing
 from benchmarks.agreement import pairwise_agreement
 from benchmarks.app import app
-from benchmarks.estimators import Vehicles, estimators
-from benchmarks.flocks import Kind, flock
+from benchmarks.estimators import estimators
 from benchmarks.modes import FRAMES, draw, enumerated, matched
 from benchmarks.sampled_traffic import providers
-from benchmarks.settling import APART, EVADING, MIXED, NEAR, SILENT, STRAIGHT, largest_difference, sample_scene
+from benchmarks.settling import EVADING, MIXED, SILENT, STRAIGHT, largest_difference, sample_scene
 from benchmarks.smoothing import smooth_known_objects, true_objects
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.smoothing import load_smooth_config
 from saga_fg.estimators import BatchSolver, IncrementalSmoother
-from saga_fg.graph import OBJECT
 from saga_fg.smoothing import gather_evidence
 
 
@@ -52,43 +50,12 @@ def test_ratios_are_those_of_the_times(rows):
     assert drivers == {"connected", "components"}
 
 
-def test_vehicles_drive_in_rows():
-    vehicles = Vehicles(6, 3, linear=False)
-    smoother = IncrementalSmoother([vehicles])
-    for k in range(8):
-        smoother.step(0.1 * k)
-    there = smoother.graph().of(OBJECT, 7)
-    places = np.stack([smoother.state(there[i].key)[:2] for i in range(6)])
-    assert np.abs(places - vehicles.start[:, :2] - [5.6, 0.0]).max() < 2.0
-
-
 def test_sizes_that_are_none_are_one_line_of_error(refused):
     for sizes in ("10,many", "1", ""):
         assert "--sizes: expected whole numbers >= 2" in refused("estimators --sizes", sizes)
 
 
-def test_flocks_are_what_their_names_say():
-    kind: Kind = "components"
-    scene = flock(kind, 20, 3, seed=1)
-    again = flock(kind, 20, 3, seed=1)
-    for frame, same in zip(scene.frames, again.frames, strict=True):
-        np.testing.assert_array_equal(frame.measurements.z, same.measurements.z)
-        (edges,) = frame.transition.graph.edges
-        assert np.bincount(edges.target, minlength=20).max() <= 4
-        assert not (edges.target == edges.source).any()
-    first, second = (frame.transition.graph.edges[0] for frame in scene.frames[:2])
-    assert first.rate.tolist()[:5] != second.rate.tolist()[:5]
-
-
 # The incremental smoother beside Levenberg-Marquardt on nonlinear scenes
-
-
-@pytest.mark.parametrize("kind", [EVADING, STRAIGHT])
-def test_two_who_cross_come_near_each_other(kind):
-    scene = sample_scene(kind, np.random.default_rng(3), frames=10)
-    apart = [np.hypot(*(one.states[0] - one.states[1])[:2]) for one in scene.frames]
-    assert apart[0] == pytest.approx(APART, abs=0.1)
-    assert min(apart) < NEAR
 
 
 def test_the_smoother_is_compared_with_the_minimum_of_the_same_graph():
@@ -122,17 +89,6 @@ def test_both_are_exact_where_one_node_has_been_measured_once():
     np.testing.assert_allclose(own[0].sigma, exact[0].sigma, rtol=1e-9)
     np.testing.assert_allclose(own[0].stands, exact[0].stands, atol=1e-9)
     assert np.abs(own[-1].mean - exact[-1].mean).max() > 1e-6
-
-
-def test_enumeration_finds_who_stands():
-    certain = []
-    for seed in range(20):
-        frames = draw(np.random.default_rng(seed), 2)
-        speed = np.linalg.norm(frames[-1].states[:, 2:], axis=1)
-        certain += zip(speed, enumerated(frames)[-1].stands, strict=True)
-    stands = np.array([p for speed, p in certain if speed < 0.3])
-    drives = np.array([p for speed, p in certain if speed > 2])
-    assert stands.mean() > drives.mean() + 0.3
 
 
 def test_the_command_prints_a_row_for_every_number_of_nodes(tmp_path):

@@ -10,22 +10,17 @@ import numpy as np
 import pytest
 
 from benchmarks import kills
-from benchmarks.endurance import EDGES, LONG, NONE, endurance, traffic_frame
+from benchmarks.endurance import EDGES, LONG, NONE, endurance
 from benchmarks.filters import JointGraphTracking, SeparateGraphTracking
 from benchmarks.flocks import flock
 from benchmarks.kills import Killed, _damage, _kill, _marked
 from benchmarks.scaling import APART, JOINT, NODES, SEPARATE
 from benchmarks.service import clocks
-from benchmarks.service.clocks import ClockFault, fault_rows, offset_figures, offset_shortcomings, wrong_clock
+from benchmarks.service.clocks import ClockFault, fault_rows, offset_figures, offset_shortcomings
 from benchmarks.service.good_client import GoodClient
-from benchmarks.service.hostile_messages import EPOCH, KINDS, MOST, SENSORS, hostile_line
 from benchmarks.service.hostile_service import bench_hostile_service, shortcomings
 from benchmarks.speed import METHODS, Ties, speed_config, speed_frames
-from benchmarks.streaming import write_traffic
-from data_tools.datasets.detection_files import read_detections
-from pipelines.config import Method, load_config
-from pipelines.serving import StreamTracker
-from pipelines.serving.messages import encode
+from pipelines.config import Method
 from saga_fg.errors import SagaError
 
 
@@ -46,12 +41,6 @@ def test_tracks_begin_and_end_and_nothing_is_lost_whatever_the_traffic(rows):
     assert (found["detections in a frame", 6], found["detections in a frame", 60]) == (6, 60)
     assert found["sensors", 1] == found["sensors", 20] > 3
     assert found["position, m", 0.0] == found["position, m", 9e8] > 3
-
-
-def test_the_traffic_is_the_same_for_the_same_number():
-    one, same, later = (traffic_frame(k, 0).detections.boxes.position for k in (7, 7, 8))
-    np.testing.assert_array_equal(one, same)
-    assert one.shape != later.shape or not np.array_equal(one, later)
 
 
 def test_what_cannot_be_run_is_refused(refused):
@@ -153,41 +142,6 @@ def test_what_is_lost_does_not_make_up_for_what_is_doubled():
         assert client.lost_and_doubled(counted) == expected, (taken, answers, counted)
 
 
-def test_no_message_in_the_name_of_a_good_sensor_takes_its_numbers():
-    config, rng = load_config("file"), np.random.default_rng(0)
-    config = replace(config, tracker=replace(config.tracker, min_hits=1))  # so that one message is answered by tracks
-    service = StreamTracker[None](lambda: config.new_tracker("kf"))
-    for sensor in SENSORS:
-        service.handle(encode({"timestamp": EPOCH, "sensor": sensor, "seq": 0, "detections": []}), None)
-    numbered = heavy = 0
-    for kind in KINDS:
-        service.handle(b'{"type": "reset"}', None)
-        for line in b"\n".join(kind(rng, EPOCH) for _ in range(5)).split(b"\n"):
-            ((_, answer),) = service.handle(line, None) or [(None, {"type": ""})]
-            heavy += answer["type"] == "tracks" and len(answer["tracks"]) > MOST / 2
-            numbered += "seq: expected at most" in answer.get("message", "")
-    assert numbered == 5
-    assert {sensor: service.status()["last_seq"][sensor] for sensor in SENSORS} == dict.fromkeys(SENSORS, 0)
-    assert heavy > 0
-
-
-def test_clocks_of_others_leave_out_hardly_any_frame():
-    """Three seconds of hostile messages, four of them between two good frames; nobody resets."""
-    config, rng, answers = load_config("file"), np.random.default_rng([0, 7]), Counter[str]()
-    service = StreamTracker[None](lambda: config.new_tracker("kf"))
-    for seq in range(150):
-        for number, sensor in enumerate(SENSORS):
-            elapsed = (seq + number / 2) / 50
-            for _ in range(4):
-                for line in hostile_line(rng, EPOCH + elapsed).split(b"\n"):
-                    if b"reset" not in line and len(line) < 2**12:
-                        service.handle(line, None)
-            frame = {"seq": seq, "timestamp": EPOCH + elapsed, "sensor": sensor, "detections": []}
-            ((_, answer),) = service.handle(encode(frame), None)
-            answers[answer["type"]] += seq > 10
-    assert answers["tracks"] >= 0.97 * (answers.total())
-
-
 # The benchmark of wrong clocks: its figures, and what falls short
 
 SIGMA = np.full(2, 0.002)
@@ -226,22 +180,7 @@ def test_offsets_are_judged_by_estimate_and_positions():
     ]
 
 
-@pytest.mark.parametrize("fault", [ClockFault("steady", 3600.0), ClockFault("jumps")], ids=str)
-def test_right_sensors_are_tracked_beside_a_wrong_one(fault):
-    assert wrong_clock(3, "radar", 5.0, fault, seed=0) >= 0.99
-
-
 # `python -m benchmarks streaming` on a short recording: it counts what was put in, and compares with the whole
-
-
-def test_cars_come_in_platoons_and_are_hidden_at_times(tmp_path):
-    write_traffic(tmp_path / "table.csv", 20, 60.0, 1, 1.0, 0.0)
-    dataset = read_detections(tmp_path / "table.csv")
-    frames = dataset.scene(dataset.scenes[0]).frames
-    assert len(frames) == 600
-    assert 0.85 < sum(len(frame) for frame in frames) / (600 * 20) < 0.99  # the others are hidden
-    roads = {round(y / 1000) for frame in frames for y in frame.detections.boxes.position[:, 1].tolist()}
-    assert len(roads) > 4  # a new platoon takes another road
 
 
 def test_memory_is_read_and_the_labels_are_those_of_the_whole(bench):
@@ -304,15 +243,6 @@ def test_every_method_has_a_row_for_every_case(bench):
     grown = {(row["case"], row["method"]) for row in rows if row["table"] == "growth"}
     assert grown == {(ties, m) for ties in ("loose", "dense") for m in METHODS}
     assert 0 < rows[-1]["p50"] <= rows[-1]["p99"]
-
-
-@pytest.mark.parametrize("ties", ["loose", "dense"])
-def test_all_simulated_objects_are_tracked_and_tied_as_said(ties):
-    tracker = speed_config(ties).new_tracker("saga")
-    for frame in speed_frames(60, ties, 12, seed=1):
-        tracks = tracker.step(frame)
-    assert len(tracks.id) == 60
-    assert sum(len(edges.target) for edges in tracker.graph.edges) >= (60 if ties == "dense" else 20)
 
 
 def peak(count: int, ties: Ties, method: Method) -> int:

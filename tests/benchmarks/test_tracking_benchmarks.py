@@ -23,13 +23,12 @@ from benchmarks.gap_runs import (
 from benchmarks.gaps import rows_of, split_runs, splits_of
 from benchmarks.recording_sets import Score, chosen_sets, simulated_set
 from benchmarks.situations import situations_of
-from benchmarks.tracking import changes, set_rows
+from benchmarks.tracking import changes
 from benchmarks.variants import COMPONENTS, changed, contenders, variants
 from data_tools.metrics import LabelErrors
-from data_tools.simulator import SimulatorSettings
 from pipelines.cli import app as product
 from pipelines.config import Family, load_config
-from pipelines.learning.gaps import CAP, LIFE, JudgedRun
+from pipelines.learning.gaps import CAP, JudgedRun
 from pipelines.learning.interactions import LearnedForms
 from saga_fg import InputError
 from saga_fg.learning.gaps import Gap
@@ -44,17 +43,6 @@ SEVEN_SECONDS = replace(SHORT, duration=7.0)
 def short_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Simulated scenes that last for seconds."""
     monkeypatch.setattr(recording_sets, "simulated_set", lambda scenes: simulated_set(scenes, settings=SEVEN_SECONDS))
-
-
-def test_contenders_and_lives_are_settings_of_every_kind_of_data():
-    families: tuple[Family, ...] = ("nuscenes", "kitti", "simulated", "file")
-    for family in families:
-        base = load_config(family)
-        for variant in variants(family).values():
-            made = variant.contender(base)
-            config = made.kept_alive().config
-            config.new_tracker(made.method)
-            assert config.tracker.max_coasting == LIFE
 
 
 def test_a_hidden_car_is_followed_by_a_filter_that_is_kept_alive():
@@ -259,7 +247,6 @@ def test_a_tracker_that_reports_nothing_unseen_is_extrapolated():
 # The tracking benchmark: variants by named settings, changes with intervals, and recordings
 
 FAMILIES: tuple[Family, ...] = ("nuscenes", "kitti", "simulated", "file")
-TRACKING_SHORT = replace(SimulatorSettings(), duration=6.0, warm_up=5.0)
 
 
 def test_every_component_is_a_setting_of_every_kind_of_data():
@@ -306,21 +293,6 @@ def test_changes_are_those_of_the_same_scenes():
         assert found["IDS, relative"].estimate == pytest.approx(1.0)
         assert found["position RMSE"].low <= 0.0 <= found["position RMSE"].high
     assert changes(saga, kf, [[0, 1, 2]], 20) == {}
-
-
-def test_a_set_is_tracked_by_every_variant():
-    base = load_config("simulated")
-    compared = contenders("simulated", base, "saga,kf,centerpoint,without following", ())
-    rows = list(set_rows(simulated_set(2, settings=replace(TRACKING_SHORT, duration=1.0)), compared, 5))
-    accuracy = {row["variant"]: row for title, row in rows if "RMSE of position" in title}
-    assert set(accuracy) == {"saga", "kf", "centerpoint", "without following"}
-    assert {"MOTA", "IDS", "hidden RMSE"} <= set(accuracy["saga"])
-    assert accuracy["centerpoint"]["/ centerpoint"] == 1.0
-    assert all(row["ms / frame"] > 0 for row in accuracy.values())
-    against = {row["variant"]: row for title, row in rows if "changes from kf" in title}
-    assert set(against) == {"saga", "without following"}
-    expected = accuracy["saga"]["position"] / accuracy["kf"]["position"] - 1
-    assert against["saga"]["position RMSE"].estimate == pytest.approx(expected)
 
 
 def test_recordings_are_chosen_by_name_and_mistakes_are_one_line(refused):

@@ -9,7 +9,6 @@ from typer.testing import CliRunner, Result
 
 from benchmarks.app import app
 from benchmarks.recordings.landmarks import read_landmark_log
-from benchmarks.recordings.ranges import trilateration
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
 from saga_fg import InputError
 
@@ -105,12 +104,6 @@ def test_beacons_are_found_by_ranges_alone(tmp_path):
     assert {landmark["number"] for landmark in json.loads((output / "landmarks.json").read_text())} == {1, 4, 6}
 
 
-def test_trilateration_is_exact_without_noise():
-    places = np.array([[0.0, 0.0], [5.0, 1.0], [2.0, -4.0], [7.0, 6.0]])
-    ranges = np.hypot(*(places - [3.0, 8.0]).T)
-    np.testing.assert_allclose(trilateration(places, ranges), [3.0, 8.0], atol=1e-9)
-
-
 def test_a_scale_that_is_none_is_refused(tmp_path):
     path, _ = park(tmp_path)
     result = landmarks(path, "--output", tmp_path / "out", "--odometry-scale", "0")
@@ -186,15 +179,6 @@ def test_ranges_to_beacons_are_read(tmp_path):
     assert drive.truth is not None
     np.testing.assert_allclose(drive.truth.positions[1], [3, 4, 0])
     assert {k: v.tolist() for k, v in drive.places.items()} == {7: [20, 30], 3: [-1, -2]}
-
-
-def test_the_truth_of_beacons_and_drive_is_optional(tmp_path):
-    path = plaza(tmp_path)
-    (tmp_path / "P_GT.txt").unlink()
-    (tmp_path / "P_TL.txt").unlink()
-    drive = read_landmark_log(path)
-    assert drive.truth is None
-    assert drive.places == {}
 
 
 def test_broken_ranges_are_located(tmp_path, subtests):

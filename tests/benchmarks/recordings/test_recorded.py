@@ -7,17 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.recording_sets import recording_set
 from benchmarks.recordings.crossings import LENGTH, LINE, RULES, simulated_crossings
 from benchmarks.recordings.ngsim import ngsim_windows
-from benchmarks.recordings.openacc import openacc_platoons
 from benchmarks.recordings.sensed import sensed_scene, true_scene
 from benchmarks.recordings.sources import Ngsim
 from benchmarks.recordings.traffic import RecordedTraffic, Recordings
 from data_tools.simulator.settings import SensorSettings, SimulatorSettings
 from pipelines.config import load_config
 from pipelines.learning import scenes_to_learn_from
-from pipelines.tracking import track_scene
 from saga_fg.errors import InputError
 from saga_fg.numerics.geometry import feet, on_it
 from saga_fg.types.dataset import Scene
@@ -104,17 +101,6 @@ def test_colours_are_reported_at_first_and_when_they_change(traffic):
     assert all(frame.road_map is traffic.road_map for frame in scene.frames)
 
 
-def test_a_vehicle_that_appears_inside_another_is_tracked_with_the_rest(tmp_path):
-    inside = [f"X,A,9,{k},car,-3.2,0.1,0,0,,4.5,1.8" for k in range(4, 12)]
-    traffic = ngsim_windows(write_ngsim(tmp_path, rows() + inside, {"A": crossing()})).read("A")
-    scene = sensed_scene(traffic, "mast", perfect(), seed=0)
-    assert scene.ground_truth is not None
-    assert len(scene.ground_truth[-1]) == 4
-    tracks = track_scene(scene, load_config("traffic").new_tracker("saga")).tracks
-    assert len(tracks) == 12
-    assert all(np.isfinite(moment.boxes.position).all() for moment in tracks)
-
-
 def test_viewpoints_that_are_none_are_errors(traffic, subtests):
     for viewpoint, message in [
         ("roof", r"--viewpoint: A: unknown viewpoint 'roof', expected one of: mast, above, vehicle, X,Y,Z, 1, 2, 3"),
@@ -151,14 +137,6 @@ def ngsim(recordings: Path) -> Recordings:
     if not (recordings / "ngsim").is_dir():
         pytest.skip("no NGSIM windows among the recordings")
     return ngsim_windows(recordings / "ngsim")
-
-
-@pytest.fixture(scope="module")
-def openacc(recordings: Path) -> Recordings:
-    pytest.importorskip("pyarrow", reason="the extra [parquet] is not installed")
-    if not (recordings / "openacc").is_dir():
-        pytest.skip("no OpenACC platoons among the recordings")
-    return openacc_platoons(recordings / "openacc")
 
 
 def test_vehicles_drive_in_the_lanes_of_the_map(ngsim):
@@ -201,40 +179,6 @@ def test_vehicles_stand_at_red_and_go_at_green(ngsim):
     assert np.mean(stand["green"]) < 0.2
 
 
-def test_dense_traffic_hides_vehicles_from_a_mast(ngsim):
-    scene = sensed_scene(ngsim.read("USA_Lanker-1_2_T-1"), "mast", None, seed=0)
-    assert scene.ground_truth is not None
-    visible = np.concatenate([truth.visible for truth in scene.ground_truth])
-    assert 0.2 < visible.mean() < 0.95
-    counts = [len(frame) for frame in scene.frames]
-    assert min(counts) > 5
-    assert scene.frames[0].road_map is not None
-
-
-def test_platoons_keep_their_order_and_plausible_gaps(openacc):
-    assert len(openacc.names) == 37
-    traffic = openacc.read("short_setting-dynamic_part4")
-    ids = traffic.vehicles.id.astype(int)
-    assert sorted(ids.tolist()) == list(range(1, 12))
-    order = np.argsort(ids)
-    position, yaw, length = (
-        traffic.vehicles.position[:, order],
-        traffic.vehicles.yaw[:, order],
-        traffic.vehicles.size[order, 0],
-    )
-    assert (length > 3).all()
-    assert (length < 6).all()
-    ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)[:, 1:]
-    offset = position[:, :-1] - position[:, 1:]
-    assert (np.einsum("kni,kni->kn", offset, ahead) > 0).mean() > 0.98  # the track is a circle
-    gap = np.hypot(*np.moveaxis(offset, -1, 0)) - (length[1:] + length[:-1]) / 2
-    assert 5 < np.median(gap) < 25
-    moved = np.hypot(*np.moveaxis(np.diff(position, axis=0), -1, 0)) / 0.1
-    both = traffic.vehicles.present[1:, order] & traffic.vehicles.present[:-1, order]
-    speed = np.hypot(*np.moveaxis(traffic.vehicles.velocity[1:, order], -1, 0))
-    assert np.quantile(np.abs(moved - speed)[both], 0.99) < 1.5
-
-
 # Simulated crossings without signals
 
 
@@ -251,19 +195,6 @@ def test_nobody_collides_and_somebody_waits(row):
     major = np.abs(np.sin(vehicles.yaw)) < 0.1
     near = np.abs(vehicles.position).max(axis=-1) < 120 - LINE + 3
     assert (stands & near & major).any() == (RULES[row] == "all-way")
-
-
-def test_a_name_and_a_seed_make_one_recording():
-    one, same, other = (simulated_crossings(2, seed).read("priority-0").vehicles for seed in (0, 0, 1))
-    np.testing.assert_array_equal(one.position, same.position)
-    assert one.position.shape != other.position.shape or (one.position != other.position).any()
-
-
-def test_the_middle_of_a_crossing_is_what_is_asked_for():
-    whole, middle = (recording_set("crossings", None, 1, longest=longest) for longest in (np.inf, 5.0))
-    (name,) = whole.dataset.scenes
-    assert middle.scene(name).timestamps[-1] == pytest.approx(5.0)
-    assert whole.scene(name).timestamps[-1] == pytest.approx(40.0)
 
 
 # Recorded traffic through the command and the benchmarks, on a crossing written by hand
