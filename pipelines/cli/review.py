@@ -12,9 +12,16 @@ from typing import Annotated
 import typer
 
 from data_tools.files.atomic_files import check_writable, write_text
-from pipelines.cli.console import working
+from pipelines.cli.console import counted, working
 from pipelines.cli.options import Verbose
-from pipelines.review import CORRECTIONS, ReviewServer, ReviewSession, read_label_run
+from pipelines.review import (
+    CORRECTIONS,
+    ReviewServer,
+    ReviewSession,
+    export_labels,
+    import_edits,
+    read_label_run,
+)
 from saga_fg.errors import InputError
 
 
@@ -37,6 +44,22 @@ def review(
             metavar="FILE",
         ),
     ] = None,
+    out: Annotated[
+        tuple[str, Path] | None,
+        typer.Option(
+            "--export",
+            help="Write the labels for a labelling tool instead: openlabel, cvat or sustechpoints, and a folder.",
+            metavar="TOOL DIR",
+        ),
+    ] = None,
+    back: Annotated[
+        tuple[str, Path] | None,
+        typer.Option(
+            "--import",
+            help="Add what was changed in a labelling tool to the corrections instead: its name, and the folder.",
+            metavar="TOOL DIR",
+        ),
+    ] = None,
     who: Annotated[str | None, typer.Option("--who", help="Your name in corrections.  [default: as logged in]")] = None,
     images: Annotated[
         int, typer.Option("--images", min=0, help="Width of the camera images in the page, pixels; 0 leaves them out.")
@@ -55,16 +78,33 @@ def review(
       saga-fg review labels
       saga-fg review labels --corrections mine.jsonl --who anna
       saga-fg review labels --page review.html   # for somebody without saga-fg
+      saga-fg review labels --export cvat boxes   # then, with what was changed there
+      saga-fg review labels --import cvat boxes
     """
     if page is not None and page.suffix not in (".html", ".htm"):
         raise InputError(f"{page}: expected a file name that ends in .html")
+    if sum(one is not None for one in (page, out, back)) > 1:
+        raise InputError("expected one of --page, --export and --import")
+    who = os.environ.get("USER", "") if who is None else who
+    out, back = ((each and (each[0], each[1].absolute())) for each in (out, back))
     run, folder, page = read_label_run(folder), folder.absolute(), page and page.absolute()
     given = Path(run.directory, run.corrections) if run.corrections else folder / CORRECTIONS
     file = given if corrections is None else corrections.absolute()
     check_writable(page or file)
     with chdir(run.directory):
+        if out is not None:
+            boxes, clouds = export_labels(folder, run, *out)
+            typer.echo(f"{out[1]}: {counted(boxes, 'box')}, {counted(clouds, 'point cloud')}")
+            return
+        if back is not None:
+            kinds, problems = import_edits(folder, run, *back, file, who)
+            for line in problems:
+                typer.echo(f"not taken over: {line}", err=True)
+            listed = ", ".join(f"{count} {kind}" for kind, count in kinds.items()) or "nothing was changed"
+            typer.echo(f"{file}: {counted(kinds.total(), 'new correction')}: {listed}")
+            return
         with working("reading the recordings"):
-            session = ReviewSession(folder, run, file, os.environ.get("USER", "") if who is None else who, images)
+            session = ReviewSession(folder, run, file, who, images)
         if page is not None:
             write_text(page, session.page(server=False))
             typer.echo(f"{page}: open it in a browser; what it saves goes to saga-fg smooth ... --corrections FILE")

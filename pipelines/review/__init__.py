@@ -1,10 +1,20 @@
 """Review of labels: a page on this machine that takes corrections, and the labels solved again with them.
 
 folder of labels + record of its run -> `ReviewSession` <-> `ReviewServer` <-> the page
+                                     -> `export_labels` -> a labelling tool -> `import_edits` -> corrections
 """
 
+from pipelines.review.exchange import export_labels, import_edits
 from pipelines.review.record import LabelRun, read_label_run
 from pipelines.review.server import ReviewServer
 from pipelines.review.session import CORRECTIONS, ReviewSession
 
-__all__ = ["CORRECTIONS", "LabelRun", "ReviewServer", "ReviewSession", "read_label_run"]
+__all__ = [
+    "CORRECTIONS",
+    "LabelRun",
+    "ReviewServer",
+    "ReviewSession",
+    "export_labels",
+    "import_edits",
+    "read_label_run",
+]

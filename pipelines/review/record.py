@@ -1,24 +1,26 @@
-"""The record of a run of smoothing, from which its labels can be made again.
+"""The record of a run of smoothing, from which its labels can be made again, and these labels.
 
 The configuration of its `RunRecord` is YAML of a `LabelRun`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
+from data_tools.datasets.detection_files import read_tracks
 from data_tools.datasets.given_tracks import TrackedRecordings, read_given_tracks
+from data_tools.datasets.results import SceneResult, scene_result
 from data_tools.datasets.source import DatasetSource, dataset_names, dataset_source
 from pipelines.config import Method
 from pipelines.configuration import read_settings, write_settings
 from pipelines.report import RunRecord, read_run_record
 from pipelines.smoothing import SmoothConfig
-from saga_fg.errors import InputError, error_context
-from saga_fg.types.dataset import Dataset
+from saga_fg.errors import InputError, error_context, unknown_name
+from saga_fg.types.dataset import Dataset, Scene
 
 
 @dataclass(frozen=True)
@@ -80,3 +82,21 @@ def read_label_run(folder: Path) -> LabelRun:
         if not Path(run.directory).is_dir():
             raise InputError(f"directory: expected the folder where they were made, there is no {run.directory}")
     return run
+
+
+def labelled_scenes(folder: Path, scenes: Mapping[str, Scene]) -> Iterator[SceneResult]:
+    """The labels of the scenes, from the table of the folder or those of its parts, in the order of the recordings.
+
+    Raises `InputError` where there is no table, or it has other scenes.
+    """
+    tables = [*folder.glob("labels.*"), *sorted((folder / "labels").glob("*.*"))]
+    if not tables:
+        raise InputError(f"{folder}: expected the table labels.csv, or tables of scenes in labels/, there are none")
+    parts = [(table, read_tracks(table, labels=True)) for table in tables]
+    for table, rows in parts:
+        if others := sorted({*rows.scene.tolist()} - {*scenes}):
+            unknown = unknown_name("scene", others[0], tuple(scenes))
+            raise InputError(f"{table}: {unknown}; these are another run's labels")
+    return (
+        scene_result(scene, rows, path) for name, scene in scenes.items() for path, rows in parts if name in rows.scene
+    )

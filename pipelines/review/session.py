@@ -14,7 +14,7 @@ import hashlib
 import json
 import threading
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from http import HTTPStatus
 from pathlib import Path
@@ -23,8 +23,6 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.corrections import check_classes, corrections_of_lines
-from data_tools.datasets.detection_files import read_tracks
-from data_tools.datasets.results import SceneResult, scene_result
 from data_tools.files.atomic_files import check_writable, write_text
 from data_tools.files.input_files import open_text, read_text
 from data_tools.files.readers import parsed_json
@@ -32,10 +30,12 @@ from data_tools.metrics import SceneBoxes
 from pipelines.report import Report, ReportScene, report_page
 from pipelines.report.page import with_surroundings
 from pipelines.report.scenes import scene_data
-from pipelines.review.record import LabelRun
+from pipelines.review.exchange import ego_points
+from pipelines.review.record import LabelRun, labelled_scenes
 from pipelines.smoothing import label_model
 from pipelines.tracking import one_thread, scene_with_frames
 from saga_fg.errors import InputError, error_context, unknown_name
+from saga_fg.numerics.geometry import transform_points
 from saga_fg.smoothing import LabelBuilder, Review
 from saga_fg.smoothing.corrections import Correction, correction_from, corrections_in
 from saga_fg.types.by_class import DEFAULT
@@ -46,7 +46,6 @@ CHANGED = ("labels", "methods", "detections")  # parts of a scene's data that fo
 LABELS = "labels"  # the name of labels as a method
 BESIDE = 12.0  # m around a box, in which the points of a scan are shown
 SPACING = 0.05  # m, to which they are thinned
-SCAN_TIME = 0.06  # s between a moment and its scan
 
 
 class ChangedElsewhereError(InputError):
@@ -71,7 +70,7 @@ class ReviewSession:
         self._answers: dict[str, tuple[Sequence[Correction], dict[str, Any]]] = {}  # the latest, by scene
         with error_context(f"{folder}: its recordings ({run.dataset}) are needed"), run.open() as (source, dataset):
             scenes = {name: scene_with_frames(dataset, name) for name in dataset.scenes}
-        shown = [_shown(found.scene, found.found, found.coasting, run) for found in _labels(folder, scenes)]
+        shown = [_shown(found.scene, found.found, found.coasting, run) for found in labelled_scenes(folder, scenes)]
         self._shown = {each.scene.name: each for each in with_surroundings(source, shown, images)}
         self._scans = source.surroundings({name: each.scene for name, each in self._shown.items()}).scans()
         self._classes = source.written.classes
@@ -135,14 +134,9 @@ class ReviewSession:
         known = self._known(scene).scene
         if not 0 <= moment < len(known):
             raise InputError(f"moment: expected 0 to {len(known) - 1}, got {moment}")
-        scans = self._scans.get(scene)
-        late = np.abs(scans.timestamps - known.timestamps[moment]) if scans is not None else np.empty(0)
-        if scans is None or not len(late) or late.min() > SCAN_TIME:
-            return []
         with self._lock:
-            points = scans[int(np.argmin(late))].points
-        pose = known.world_T_ego[moment] @ scans.ego_T_lidar
-        places = (points @ pose[:3, :3].T + pose[:3, 3])[:, :2]
+            points = ego_points(self._scans.get(scene), float(known.timestamps[moment]))
+        places = transform_points(known.world_T_ego[moment], points)[:, :2]
         near = places[np.hypot(*(places - [x, y]).T) < BESIDE] - known.world_T_ego[0, :2, 3]
         cells = np.unique(np.rint(near / SPACING), axis=0)
         thinned: list[list[int]] = np.rint(100 * SPACING * cells).astype(np.int64).tolist()
@@ -212,21 +206,6 @@ def _shown(scene: Scene, found: SceneBoxes, coasting: Any, run: LabelRun) -> Rep
     """A scene with labels; without edges, which take long to find."""
     bare = replace(scene, ground_truth=None)
     return ReportScene(bare, {LABELS: found}, {LABELS: coasting}, (), run.config.tracking.sensors)
-
-
-def _labels(folder: Path, scenes: Mapping[str, Scene]) -> Iterator[SceneResult]:
-    """The labels of the scenes, from the table of the folder or those of its parts, in the order of the recordings."""
-    tables = [*folder.glob("labels.*"), *sorted((folder / "labels").glob("*.*"))]
-    if not tables:
-        raise InputError(f"{folder}: expected the table labels.csv, or tables of scenes in labels/, there are none")
-    parts = [(table, read_tracks(table, labels=True)) for table in tables]
-    for table, rows in parts:
-        if others := sorted({*rows.scene.tolist()} - {*scenes}):
-            unknown = unknown_name("scene", others[0], tuple(scenes))
-            raise InputError(f"{table}: {unknown}; these are another run's labels")
-    return (
-        scene_result(scene, rows, path) for name, scene in scenes.items() for path, rows in parts if name in rows.scene
-    )
 
 
 def _listed(folder: Path) -> list[dict[str, str]]:

@@ -13,6 +13,7 @@ import random
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +25,16 @@ from benchmarks.recordings.openacc import openacc_platoons
 from data_tools.datasets.argoverse2 import ArgoverseLogs
 from data_tools.datasets.corrections import read_corrections
 from data_tools.datasets.detection_files import read_detections, read_predictions, read_tracks, read_truth
+from data_tools.datasets.edits import Edits
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.datasets.kitti.source import read_scored_sequences
+from data_tools.datasets.labelling_tools import read_from_tool, write_for_tool
 from data_tools.datasets.motchallenge import MotSequences
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes
+from data_tools.datasets.results import SceneResult
 from data_tools.laser import read_carmen
 from data_tools.lidar import Scan, read_scan
+from data_tools.metrics import SceneBoxes
 from data_tools.pose_graphs import read_g2o
 from data_tools.recordings import open_recording
 from data_tools.sensor_logs import read_sensor_log
@@ -44,6 +49,8 @@ from pipelines.serving import StateKeeper, StreamTracker
 from pipelines.slam.configuration import SlamConfig, load_slam_config
 from pipelines.slam.submaps import SlamMap, read_map, write_map
 from saga_fg.model.ground_camera import GroundCamera
+from saga_fg.smoothing.corrections import correction_from
+from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Dataset, Scene
 from tests.benchmarks.recordings.ngsim_example import HEADER, crossing, rows
 from tests.data_tools.kitti_example import write_sequence
@@ -198,6 +205,7 @@ def targets(folder: Path) -> dict[str, Target]:
         **_traffic(folder),
         **_recordings(folder),
         "corrections": one("c.jsonl", CORRECTIONS, read_corrections),
+        **_tools(folder / "tools"),
         "predictions": one("a.predictions.csv", PREDICTIONS, lambda path: read_predictions(folder / "a")),
         "state": _state(folder / "state.saga", config),
         "journal": one("tracks.csv.journal.jsonl", JOURNAL, lambda path: list(read_events(path))),
@@ -205,6 +213,28 @@ def targets(folder: Path) -> dict[str, Target]:
         "record of labels": Target((table("run.json", LABEL_RECORD),), lambda: read_label_run(folder)),
         "stream": one("messages.ndjson", MESSAGES, lambda path: _stream(path, lambda: config.new_tracker("saga"))),
     }
+
+
+def _tools(folder: Path) -> dict[str, Target]:
+    """The labels of two moments in the form of each labelling tool."""
+    folder.mkdir()
+    scene = Scene("a", np.arange(2.0), np.tile(np.eye(4), (2, 1, 1)), ("",) * 2, ())
+    boxes = Boxes.of(["car", "bus", "car"], np.ones((3, 3)), np.full((3, 3), 2.0), np.zeros(3))
+    labels = SceneResult(scene, SceneBoxes(np.array([0, 0, 1]), np.array(["1", "2", "1"]), boxes, np.ones(3)))
+    found = {}
+    for tool in ("openlabel", "cvat", "sustechpoints"):
+        path = folder / (f"{tool}.json" if tool == "openlabel" else tool)
+        write_for_tool(path, tool, labels)
+        files = (path,) if path.is_file() else tuple(sorted(path.rglob("*.json")))
+        found[f"labels, {tool}"] = Target(files, partial(_read_tool, path, tool, labels))
+    return found
+
+
+def _read_tool(path: Path, tool: str, labels: SceneResult) -> SceneBoxes:
+    back, frames = read_from_tool(path, tool, labels.scene, ("car", "bus"))
+    for record in Edits(labels, back, frames).corrections():
+        correction_from(record)
+    return back
 
 
 def _image(path: Path) -> dict[str, Target]:

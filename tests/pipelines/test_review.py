@@ -9,7 +9,8 @@ import signal
 import socket
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,9 +23,14 @@ import yaml
 
 from data_tools.datasets.corrections import read_corrections
 from data_tools.datasets.detection_files import read_tracks
+from data_tools.datasets.labelling_tools import read_from_tool, write_for_tool
+from data_tools.datasets.results import SceneResult
+from data_tools.lidar import Scan, read_scan
+from data_tools.metrics import SceneBoxes
 from pipelines.review import CORRECTIONS, ReviewServer, ReviewSession, read_label_run
 from pipelines.review.server import LARGEST
 from saga_fg import InputError
+from saga_fg.types.dataset import Scene
 from tests.pipelines.command import COMMAND, done, refused
 
 HEADER = "scene,timestamp,label,x,y,length,width,height,yaw,score"
@@ -469,3 +475,71 @@ def test_the_command_serves_until_it_is_interrupted(labels):
     assert command.returncode == 0, told
     assert f"--corrections {labels / CORRECTIONS}" in told
     assert len(read_corrections(labels / CORRECTIONS)) == 1
+
+
+def edit_in_tool(folder: Path, tool: str, scene: Scene, change: Callable[[SceneBoxes], SceneBoxes]) -> None:
+    """What somebody does with a scene in a labelling tool."""
+    path = folder / (f"{scene.name}.json" if tool == "openlabel" else scene.name)
+    found, _ = read_from_tool(path, tool, scene, ["car", "bus"])
+    write_for_tool(path, tool, SceneResult(scene, change(found)))
+
+
+def parked_passing(found: SceneBoxes) -> SceneBoxes:
+    """Without what is parked; the car that passes by is a bus, and at one moment 0.8 m to the right."""
+    found = found.select(found.boxes.position[:, 1] < 4)
+    passing = found.boxes.position[:, 1] < -4
+    position = found.boxes.position - 0.8 * (passing & (found.frame == 3))[:, None] * np.array([0, 1, 0])
+    return replace(found, boxes=replace(found.boxes, position=position, label=np.where(passing, "bus", "car")))
+
+
+@pytest.mark.parametrize("tool", ["openlabel", "cvat", "sustechpoints"])
+def test_labels_go_out_to_a_tool_and_edits_come_back(made, labels, tmp_path, tool):
+    out, mine = tmp_path / "out", labels / CORRECTIONS
+    assert f"{out}: 144 boxes, 0 point clouds" in done("review", labels, "--export", tool, out).output
+    assert "0 new corrections: nothing was changed" in done("review", labels, "--import", tool, out).output
+    assert not mine.exists()
+    with read_label_run(labels).open() as (_, dataset):
+        edit_in_tool(out, tool, dataset.scene("a"), parked_passing)
+    told = done("review", labels, "--import", tool, out, "--who", "anna").output
+    assert f"{mine}: 3 new corrections: 1 exists, 1 class, 1 box" in told
+    assert {(one.who, one.scene) for one in read_corrections(mine)} == {("anna", "a")}
+    assert "0 new corrections" in done("review", labels, "--import", tool, out).output  # they are there
+    done("smooth", "file", made / "two.csv", "--corrections", mine, "-o", tmp_path / "mended")
+    rows = read_tracks(tmp_path / "mended" / "labels.csv", labels=True)
+    rows = rows.select(np.flatnonzero(rows.scene == "a"))
+    y = rows.boxes.position[:, 1]
+    assert not ((y > 4) & (y < 12)).any()
+    assert set(rows.boxes.label[y < -4].tolist()) == {"bus"}
+    (moved,) = np.flatnonzero((y < -4) & (rows.timestamp == 3 * STEP))
+    assert y[moved] < -8.2
+    assert rows.source[moved] == "corrected"
+
+
+def test_what_is_wrong_with_a_tool_or_its_files_is_one_line(labels, tmp_path):
+    out = tmp_path / "out"
+    assert "unknown labelling tool 'cavt'; did you mean 'cvat'?" in refused("review", labels, "--export", "cavt", out)
+    assert not out.exists()
+    assert f"{out}: expected a.json, as written by" in refused("review", labels, "--import", "openlabel", out)
+    assert "expected one of" in refused("review", labels, "--export", "cvat", out, "--import", "cvat", out)
+    done("review", labels, "--export", "openlabel", out)
+    (out / "b.json").unlink()
+    assert f"{out / 'b.json'}: there is no such" in done("review", labels, "--import", "openlabel", out).stderr
+    whole = (out / "a.json").read_text()
+    for text, expected in (
+        (whole[:-9], "a.json: broken or truncated JSON"),
+        (whole.replace('"type": "car"', '"type": "kart"'), "a.json: frame 0: unknown class 'kart'"),
+        (whole.replace('"23": {"frame', '"24": {"frame'), "a.json: frame 24: expected each frame once, of"),
+    ):
+        (out / "a.json").write_text(text)
+        assert expected in refused("review", labels, "--import", "openlabel", out)
+        assert not (labels / CORRECTIONS).exists()
+
+
+def test_scans_go_out_in_the_coordinates_of_the_boxes(labels, tmp_path, monkeypatch):
+    surroundings = SimpleNamespace(scans=lambda: {"a": OneScan()})
+    monkeypatch.setattr("data_tools.datasets.source.DatasetSource.surroundings", lambda *_: surroundings)
+    monkeypatch.setattr(OneScan, "__getitem__", lambda *_: Scan.of(np.array([[0.0, -18.0, 0.0]])))
+    assert "1 point cloud" in done("review", labels, "--export", "sustechpoints", tmp_path / "out").output
+    (cloud,) = (tmp_path / "out").rglob("*.pcd")
+    assert cloud.relative_to(tmp_path / "out").as_posix() == "a/lidar/000004.pcd"
+    np.testing.assert_allclose(read_scan(cloud).points, [[20.0, 0.0, 1.8]], atol=1e-5)
