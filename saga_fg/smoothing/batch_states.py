@@ -339,11 +339,10 @@ def _measured(evidence: Evidence, object_of: IntArray, rows: slice, weight: Floa
 def _node_types(lifespans: Lifespans, classes: Mapping[str, OfflineClass]) -> list[NodeType]:
     """The node type of each object; classes that move alike share one."""
     types: dict[float, NodeType] = {}
-    result = []
-    for label in lifespans.label.tolist():
-        motion = class_settings(classes, OfflineClass, label).motion
-        result.append(types.setdefault(motion.acceleration_noise, NodeType("object", motion)))
-    return result
+    labels, number = np.unique(lifespans.label, return_inverse=True)
+    motions = [class_settings(classes, OfflineClass, label).motion for label in labels.tolist()]
+    found = [types.setdefault(motion.acceleration_noise, NodeType("object", motion)) for motion in motions]
+    return [found[k] for k in number.tolist()]
 
 
 def _first_positions(evidence: Evidence, object_of: IntArray, lifespans: Lifespans) -> FloatArray:

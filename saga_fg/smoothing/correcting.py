@@ -217,10 +217,12 @@ class _Edits:
         if not inside.any():
             self.outcome[number] = "no step between two detections lies between the two times"
             return
-        later = rows[int(np.argmax(np.where(inside, jump + gap, -1.0))) + 1 :]
+        last = int(np.argmax(np.where(inside, jump + gap, -1.0)))
+        later = rows[last + 1 :]
         new = NEW_ID + number
         self._object_of[later], self._track_of[later] = new, new
-        cut = float(time[len(rows) - len(later)])
+        cut = float(time[last : last + 2].mean())
+        self._say(("same", *sorted((id_, new))), number, one)
         self._moved.append((id_, cut, new))
         self._boxes = {
             (new if i == id_ and evidence.times[k] >= cut else i, k): box for (i, k), box in self._boxes.items()
