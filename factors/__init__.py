@@ -32,7 +32,7 @@ from factors.measurement import (
     RangeRate,
     detection_factors,
 )
-from factors.nonlinear import ResidualFactors, residual_factor, unwrapped_angles
+from factors.nonlinear import ResidualFactors, residual_factor
 from factors.relative import relative_factors
 from factors.robust import Mixture, Robust, RobustLoss
 from factors.solver import Linearisable, Solution, SolverSettings, linearised, solve
@@ -90,5 +90,4 @@ __all__ = [
     "relative_factors",
     "residual_factor",
     "solve",
-    "unwrapped_angles",
 ]

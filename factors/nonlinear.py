@@ -14,17 +14,12 @@ GTSAM trusts them: an unset Jacobian or one of a wrong shape crashes the interpr
 over nothing unchecked; whatever goes wrong in a user's function travels through GTSAM's C++ to the caller as a
 `FactorError`. Right for batch optimisers, which leave the values they were given untouched; an exception within
 `ISAM2.update` leaves that object unusable.
-
-An angle has a branch cut: while a pose turns once round, a component that is one jumps by 2 pi somewhere (in degrees,
-by 360). Where the jump goes from pi to -pi, the residual wraps the angle itself, or the measured angle is 0; elsewhere
-a small deviation is taken for a full turn.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any
 
 import gtsam
@@ -33,8 +28,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from factors.gaussian import gaussian_graph, whitened_factors
 from factors.manifolds import (
-    PlanarPose,
-    SpatialPose,
     Variable,
     Vector,
     central_differences,
@@ -301,62 +294,3 @@ def _column(values: gtsam.Values, keys_of_rows: KeyArray, variable: Variable) ->
 
 def _chosen_rows(array: FloatArray, chosen: IntArray | None) -> FloatArray:
     return array if chosen is None else array[chosen]
-
-
-_STEPS = 16  # of a full turn
-_HALVINGS = 24  # of a step, which leave 2e-8 rad
-_FULL = np.array([2 * np.pi, 360.0])
-_SAME = 1e-4  # of a full turn
-
-
-def unwrapped_angles(factors: ResidualFactors, values: gtsam.Values) -> tuple[int, ...]:
-    """Components of the first residual that are angles, unwrapped, and are not named in `angles`.
-
-    Poses among the variables are turned about their vertical, one at a time; without poses nothing is found.
-    """
-    found: set[int] = set()
-    states = factors.states(values)
-    for place, variable in enumerate(factors.types):
-        if isinstance(variable, PlanarPose | SpatialPose):
-            try:
-                found |= _jumps(factors, states, place)
-            except FactorError:  # a pose that turned too far, to where the factor is undefined
-                continue
-    return tuple(sorted(found - set(factors.angles)))
-
-
-def _jumps(factors: ResidualFactors, states: Sequence[Any], place: int) -> set[int]:
-    """Components that jump by a full turn, not from half of one to minus half, while one pose turns."""
-    turns = np.linspace(0.0, 2 * np.pi, _STEPS + 1)
-    residuals = [_turned(factors, states, place, turn) for turn in turns]
-    found = set()
-    for step, (before, after) in enumerate(pairwise(residuals)):
-        for component in np.flatnonzero(np.abs(after - before) > np.pi).tolist():
-            low, high = turns[step], turns[step + 1]
-            ends = before[component], after[component]
-            for _ in range(_HALVINGS):
-                middle = (low + high) / 2
-                at = _turned(factors, states, place, middle)[component]
-                if abs(at - ends[0]) > abs(ends[1] - at):
-                    high, ends = middle, (ends[0], at)
-                else:
-                    low, ends = middle, (at, ends[1])
-            jump = abs(ends[1] - ends[0])
-            whole = (np.abs(jump / _FULL - 1) < _SAME).any()
-            if whole and abs(abs(ends[0]) / jump - 0.5) > _SAME:
-                found.add(component)
-    return found
-
-
-def _turned(factors: ResidualFactors, states: Sequence[Any], place: int, turn: float) -> FloatArray:
-    """The first residual after a pose has turned about the vertical."""
-    moved = list(states)
-    if factors.single:
-        delta = np.zeros(factors.types[place].dim)
-        delta[2] = turn  # in the plane and in space
-        moved[place] = factors.types[place].retract(states[place], delta)
-    else:
-        turned = np.eye(states[place].shape[-1])
-        turned[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-        moved[place] = states[place] @ turned
-    return np.asarray(factors.residuals_at(moved)[0])

@@ -3,7 +3,6 @@
 from saga_fg.estimators.batch import BatchSolver
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.estimator import Estimator
-from saga_fg.estimators.graduated import GraduatedNonConvexity
 from saga_fg.estimators.graph_filter import GraphFilter
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
@@ -20,7 +19,6 @@ __all__ = [
     "DetectionFactors",
     "Estimator",
     "Gaussian",
-    "GraduatedNonConvexity",
     "GraphFilter",
     "GraphSolution",
     "IncrementalSmoother",

@@ -2,8 +2,7 @@
 
 Providers are asked epoch by epoch, as by `saga_fg.estimators.IncrementalSmoother`, or a graph is handed over whole;
 it is solved when somebody asks for an estimate. Residual functions of one family are linearised together in NumPy
-(`factors.solve`); losses that ask for graduated non-convexity get it (`saga_fg.estimators.graduated`). A last step by
-QR brings back the digits that Cholesky leaves behind, unless cliques are wide.
+(`factors.solve`). A last step by QR brings back the digits that Cholesky leaves behind, unless cliques are wide.
 """
 
 from __future__ import annotations
@@ -12,9 +11,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from factors import FactorError, SolverSettings, linearised
+from factors import FactorError, SolverSettings, linearised, solve
 from saga_fg.errors import require_type
-from saga_fg.estimators.graduated import solve_graduated
 from saga_fg.estimators.solution import GraphSolution
 from saga_fg.graph.factor_checks import solver_error
 from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
@@ -133,7 +131,7 @@ def _minimise(graph: SceneFactorGraph, settings: SolverSettings) -> GraphSolutio
     """The minimum, to which the graph moves."""
     native, ours = graph.solver_inputs()
     try:
-        found = solve_graduated(native, ours, graph.values, settings)
+        found = solve(native, ours, graph.values, settings)
         rough = GraphSolution(
             LinearisationPoint(graph.variables, found.values, found.values), found.linear, found.converged
         )

@@ -30,7 +30,6 @@ from factors import (
     Variable,
     Vector,
     residual_factor,
-    unwrapped_angles,
 )
 from factors.manifolds import Manifold
 from factors.robust import each_of
@@ -188,16 +187,6 @@ def _present(provider: str, name: str, keys: Sequence[int], variables: Variables
 
 def _refuse(provider: str, name: str, variables: Sequence[GraphVariable], wrong: str) -> None:
     raise GraphError(f"provider {provider}: {name} on {', '.join(map(str, variables))}: {wrong}")
-
-
-def check_angles(provider: str, group: FactorGroup, variables: Variables, values: gtsam.Values) -> None:
-    """Raise `GraphError` if the first residual of a group has an angle that nobody wraps."""
-    if isinstance(group, ResidualGroup) and group.rows and (angles := unwrapped_angles(group.factors, values)):
-        wrong = (
-            f"component {angles[0]} of the residual jumps by a full turn while the pose turns; "
-            f"expected rad, and angles={group.factors.angles + angles} in the factor"
-        )
-        _refuse(provider, group.name, [variables[key] for key in group.rows[0]], wrong)
 
 
 def solver_error(variables: Variables, groups: Mapping[int, HeldGroup], error: Exception) -> GraphError:

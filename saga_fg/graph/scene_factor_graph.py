@@ -33,7 +33,6 @@ from factors.gaussian import Elimination
 from saga_fg.errors import require_type
 from saga_fg.graph.factor_checks import (
     Factor,
-    check_angles,
     check_variables,
     factor_error,
     grouped,
@@ -75,7 +74,6 @@ class Condensation(Protocol):
 
 _MARGINALS = "marginals"
 _RECORDED = (LinearGroup, ResidualGroup)  # groups that are values
-_FEW = 5  # factors of a kind whose angles are checked: a measured angle of 0 tells nothing
 WIDE = 256  # dimensions that hang together, from which Cholesky, with half the digits, takes half as long as QR
 
 
@@ -90,7 +88,6 @@ class SceneFactorGraph:
         self._base, self._values = gtsam.Values(), gtsam.Values()
         self.index = FactorIndex()
         self.elimination: Elimination = elimination
-        self._angles_checked: dict[tuple[str, str], int] = {}
         self.epoch, self.time, self.previous_time = -1, -math.inf, -math.inf
         self.births: dict[int, int] = {}  # when each variable was added: one that comes back is another
         self._added = 0
@@ -200,11 +197,6 @@ class SceneFactorGraph:
         held = [HeldGroup(provider, name, group, np.ones(len(group.rows), dtype=bool)) for group in groups]
         point = self.point()
         linear = [self.linearised(one, one.rows, point) for one in held]
-        for one in held:
-            kind = (provider, one.factors.name)
-            if (checked := self._angles_checked.get(kind, 0)) < _FEW:
-                check_angles(provider, one.factors, self._variables, self._values)
-                self._angles_checked[kind] = checked + 1
         if name is not None:
             for number in self.index.named(provider, name):
                 self.index.remove(number)
@@ -224,14 +216,14 @@ class SceneFactorGraph:
         eliminated = sorted(leaving.keys() & set(touched.keyVector()))
         if into is not None:
             made = into.factors(self._eliminated(touched, eliminated, "qr"), point)
-            self._replace(rows, [], leaving)
+            self.replace_rows(rows, [], leaving)
             self.add_factors(into.name, made)
             return
         self.replace_rows(rows, self._eliminated(touched, eliminated, self.elimination), leaving)
 
     def drop(self, keys: Set[int]) -> None:
         """Take out variables with all factors on them, which are on no others: whole components."""
-        self._replace(self.index.rows_on(keys), [], keys)
+        self.replace_rows(self.index.rows_on(keys), [], keys)
 
     def replace_rows(
         self, rows: Mapping[int, list[int]], factors: Sequence[gtsam.JacobianFactor], leaving: Iterable[int]
@@ -240,19 +232,6 @@ class SceneFactorGraph:
 
         They are all rows on these. Returns the numbers of the priors' groups, one each.
         """
-        numbers = self._replace(rows, factors, leaving)
-        if factors:
-            self._choose(max(factor.cols() - 1 for factor in factors))
-        return numbers
-
-    def replace_by_prior(self, leaving: Collection[int], prior: gtsam.JacobianFactor) -> None:
-        """Put a prior, on increments from the base, in place of all factors on its variables and those `leaving`."""
-        self.replace_rows(self.index.rows_on({*leaving, *prior.keys()}), [prior], leaving)
-
-    def _replace(
-        self, rows: Mapping[int, list[int]], factors: Sequence[gtsam.JacobianFactor], leaving: Iterable[int]
-    ) -> list[int]:
-        """Take rows of groups out and put priors in, then take out the variables without any factor left."""
         priors = [PriorGroup(stacked([factor], self.point().dims(factor.keys()))) for factor in factors]
         for number, mine in rows.items():
             self.index.deactivate(number, mine)
@@ -262,7 +241,13 @@ class SceneFactorGraph:
             self.index.remove_variable(key)
             self._values.erase(key)
             self._base.erase(key)
+        if factors:
+            self._choose(max(factor.cols() - 1 for factor in factors))
         return added
+
+    def replace_by_prior(self, leaving: Collection[int], prior: gtsam.JacobianFactor) -> None:
+        """Put a prior, on increments from the base, in place of all factors on its variables and those `leaving`."""
+        self.replace_rows(self.index.rows_on({*leaving, *prior.keys()}), [prior], leaving)
 
     def independent(self, keys: Set[int]) -> bool:
         """Whether all factors on some variables are linear, and priors alone tie them to other variables."""

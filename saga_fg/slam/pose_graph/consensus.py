@@ -1,8 +1,12 @@
 """Selection of the true loop closures of a pose graph.
 
 Odometry (between successive poses), priors, known places and landmarks are trusted. First, graduated non-convexity
-with truncated least squares from dead reckoning (`saga_fg.estimators.graduated`), c^2 the 99 % quantile of chi^2: in
-each step of mu one weighted Gauss-Newton step.
+with truncated least squares from dead reckoning, c^2 the 99 % quantile of chi^2: in each step of mu one weighted
+Gauss-Newton step. s is the distance of a loop in standard deviations, and the weights of the surrogate are
+
+    w = 1                             s^2 <= mu/(mu+1) c^2
+        0                             s^2 >= (mu+1)/mu c^2       mu from c^2 / (2 s_max^2 - c^2) up, by 1.4,
+        c/s sqrt(mu(mu+1)) - mu       in between                 until every weight is 0 or 1
 
 Then data snooping: each loop is judged by the solution without it,
 
@@ -33,7 +37,6 @@ from scipy.stats import chi2
 
 from factors import ResidualFactors, linearised, solve
 from saga_fg.errors import InputError
-from saga_fg.estimators.graduated import MAX_STAGES, GraduatedNonConvexity
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.slam.pose_graph.chordal import factorised
 from saga_fg.slam.pose_graph.graph import PoseGraph, trusted
@@ -51,6 +54,9 @@ _CERTAIN = 0.999  # of a true loop within the gate: few of many loops may be los
 _TAILS = 8.0  # m: loops of recordings have tails far longer than Gaussian ones
 _FEWEST = 8  # loops that tell a variance of unit weight
 _MOST_ROUNDS = 50
+_MAX_STAGES = 200
+_STEP = 1.4  # of mu, as in the paper
+_BINARY = 1e-6  # distance from 0 or 1 at which a weight counts as there
 _BLOCK = 200  # loops whose covariances are solved for at once
 
 
@@ -191,16 +197,25 @@ class _Problem:
 
 def _graduated(problem: _Problem, values: gtsam.Values, loop: BoolArray) -> tuple[gtsam.Values, FloatArray]:
     """Poses and weights (M,) by truncated least squares."""
-    loss = GraduatedNonConvexity(np.sqrt(problem.gate))
-    mu: float | None = loss.first(problem.distances(values)[loop])
+    scale = float(np.sqrt(problem.gate))
+    ratio = float(np.max(problem.distances(values)[loop], initial=0.0) / scale) ** 2
+    mu = 1 / (2 * ratio - 1) if 2 * ratio > 1 else np.inf
     weights = np.ones(len(loop))
-    for _ in range(MAX_STAGES):
-        if mu is None:
-            break
-        weights[loop] = loss.weights(mu, problem.distances(values)[loop])
+    for _ in range(_MAX_STAGES):
+        weights[loop] = _surrogate_weights(mu, problem.distances(values)[loop] / scale)
         values = problem.step(values, weights)
-        mu = loss.next(mu, weights)
+        if (np.minimum(weights, 1 - weights) < _BINARY).all():
+            break
+        mu *= _STEP
     return values, weights
+
+
+def _surrogate_weights(mu: float, s: FloatArray) -> FloatArray:
+    """Weights (M,) of loops at distances s (M,), in units of c, by the surrogate of a parameter mu."""
+    if np.isinf(mu):
+        return np.asarray((s <= 1).astype(np.float64))
+    between = np.sqrt(mu * (mu + 1)) / np.maximum(s, 1e-300) - mu
+    return np.asarray(np.where(s**2 <= mu / (mu + 1), 1.0, np.where(s**2 >= (mu + 1) / mu, 0.0, between)))
 
 
 def _snooped(

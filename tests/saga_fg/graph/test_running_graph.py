@@ -1,6 +1,5 @@
 """Laws of the running graph. Law 1: what is linear equals the textbook, whatever comes and goes."""
 
-import copy
 from functools import partial
 
 import gtsam
@@ -24,7 +23,6 @@ from saga_fg.conformance.programs import (
 from saga_fg.errors import InputError
 from saga_fg.estimators import (
     BatchSolver,
-    GraduatedNonConvexity,
     GraphFilter,
     IncrementalSmoother,
     JointKalmanFilter,
@@ -328,25 +326,6 @@ def test_what_goes_in_acts(make):
     kinds = (VehicleProvider, ObjectProvider, DetectionProvider)
     together, by_themselves = (stepped(make([kind(made) for kind in kinds]), scene) for made in (scene, alone))
     assert apart(together, by_themselves) > 0.1
-
-
-@pytest.mark.parametrize(("seed", "loss"), [*((k, "truncated") for k in range(4)), (1, "geman-mcclure")])
-def test_graduated_non_convexity_does_not_care_for_outliers(seed, loss):
-    """A fifth, or a tenth, of the detections far off: all is where it is without these."""
-    rng = np.random.default_rng(seed)
-    clean = sample_traffic(rng, frames=8, cars=3, pedestrians=2)
-    spoilt, wrong = copy.deepcopy(clean), 0
-    for moment, without in zip(spoilt.frames, clean.frames, strict=True):
-        for node in list(without.seen):
-            if rng.random() < (0.2 if loss == "truncated" else 0.1):
-                moment.seen[node] = moment.seen[node] + [rng.uniform(3, 8), rng.choice([-0.3, 0.3])]
-                wrong += 1
-                del without.seen[node]
-    solved = stepped(BatchSolver(providers(spoilt, GraduatedNonConvexity(5.0, loss))), spoilt)
-    alone, squares = (stepped(BatchSolver(providers(scene)), scene) for scene in (clean, spoilt))
-    assert wrong > 1
-    assert apart(solved, alone) < (1e-3 if loss == "truncated" else 0.5)
-    assert apart(squares, alone) > 5.0
 
 
 class Half:

@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 
 from factors import (
-    PlanarPose,
     ResidualFactors,
     Vector,
     gaussian_factor,
     interaction_factor,
-    pose_prior_factor,
     prior_factor,
     residual_factor,
 )
@@ -319,47 +317,3 @@ def test_settings_and_snapshots_are_checked():
         IncrementalSmoother().restore(3)
     with pytest.raises(GraphError, match="object 4 of epoch 2 is not in the graph"):
         SceneFactorGraph().state(key_of(OBJECT, 4, 2))
-
-
-class Bearings:
-    """A pose that sees a post behind it, by a factor whose residual is an angle."""
-
-    name = "radar"
-
-    def __init__(self, angles, measured=3.1):
-        self.angles, self.measured = angles, measured
-
-    def factors(self, view):
-        key, post = view.key(EGO_POSE, 0), view.key(LANDMARK, 5, static=True)
-
-        def bearing(pose, place):
-            return [np.arctan2(*pose.transformTo(place)[::-1]) - self.measured]
-
-        seen = residual_factor(
-            (key, post), (PlanarPose(), Vector(2)), bearing, [[1e-4]], angles=self.angles, name="bearing"
-        )
-        new = [NewVariable(EGO_POSE, 0, gtsam.Pose2(1, 2, 0.3)), NewVariable(LANDMARK, 5, np.zeros(2), static=True)]
-        known = [pose_prior_factor(key, np.eye(3), np.eye(3)), prior_factor(post, np.zeros(2), np.eye(2))]
-        return Additions(new, [*known, seen])
-
-
-def test_an_angle_that_nobody_wraps_is_refused_with_what_it_takes():
-    with pytest.raises(GraphError, match=r"radar: bearing on .*0.40 s.*5.* jumps by a full turn .*angles=\(0,\)"):
-        IncrementalSmoother(providers=[Bearings(())]).step(0.4)
-    IncrementalSmoother(providers=[Bearings((0,))]).step(0.4)
-
-
-def test_a_first_angle_of_zero_does_not_hide_that_nobody_wraps():
-    graph, radar = SceneFactorGraph(), Bearings((), measured=0.0)
-    for epoch, measured in enumerate((0.0, 0.0, 0.2)):
-        graph.advance(float(epoch))
-        keys = graph.add_variables("radar", [NewVariable(EGO_POSE, 0, gtsam.Pose2(0, 0, 3.0))])
-        radar.measured = measured
-        factor = residual_factor(
-            tuple(keys), (PlanarPose(),), lambda pose: [pose.theta() - radar.measured], [[1e-4]], name="compass"
-        )
-        if measured:
-            with pytest.raises(GraphError, match="jumps by a full turn"):
-                graph.add_factors("radar", [factor])
-        else:
-            graph.add_factors("radar", [factor])
