@@ -16,7 +16,6 @@ from birds_eye_picture import write_birds_eye_picture
 from concept_pictures import write_concept_pictures
 from crowd_picture import write_crowd_picture
 from heterogeneous_picture import write_heterogeneous_picture
-from running_graph_picture import write_running_graph_pictures
 from scaling_picture import write_scaling_picture
 from slam_loops_picture import write_loops_picture
 
@@ -73,7 +72,6 @@ def main() -> None:
     write_crowd_picture(HERE / "crowd.png")
     write_scaling_picture(HERE / "scaling.png")
     write_heterogeneous_picture(HERE)
-    write_running_graph_pictures(HERE)
     write_loops_picture(HERE)
     if data := os.environ.get("SAGA_FG_DATA"):
         gap = "-m benchmarks gaps --sets ngsim --test USA_US101-12_1_T-1 --passes 2 --lengths 3,5 --life kept"

@@ -7,7 +7,6 @@ A journal lies beside the result it belongs to, `RESULT.journal.jsonl`, an event
 
 from __future__ import annotations
 
-import bisect
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -21,7 +20,6 @@ from data_tools.figures import FigureTable, count
 from data_tools.files.atomic_files import atomic_file
 from data_tools.files.input_files import open_bytes
 from data_tools.files.readers import parsed_json
-from data_tools.plots import running_graph_picture
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import OnlineTracker
 from saga_fg.errors import InputError
@@ -141,39 +139,6 @@ def read_graphs(journal: Path) -> dict[str, list[Event]]:
         if event.get("event") == "graph":
             graphs.setdefault(str(event.get("scene")), []).append(event)
     return graphs
-
-
-def graph_picture(
-    by_scene: Mapping[str, Sequence[Event]], scene: str | None, time: float, track: str | None = None
-) -> Any:
-    """Return a matplotlib `Figure` of the last graph up to `time`, s after the first one; around a track, if named.
-
-    Raises `InputError` for a scene without graphs, several of which none is named, a time before or after them all, a
-    track that is not in it, and for events that are no graph.
-    """
-    if scene is None and len(by_scene) == 1:
-        (scene,) = by_scene
-    if scene is None or scene not in by_scene:
-        raise InputError(f"--scene: expected one of those with graphs, {', '.join(by_scene) or 'there are none'}")
-    graphs = by_scene[scene]
-    try:
-        elapsed = [graph["time"] - graphs[0]["time"] for graph in graphs]
-        if not 0 <= time <= elapsed[-1] + 1.0:
-            raise InputError(f"--time {time:g}: expected 0 to {elapsed[-1]:.2f} s after the scene's first frame")
-        chosen = bisect.bisect_right(elapsed, time + 1e-6) - 1
-        graph = graphs[chosen]
-        centre = None
-        if track is not None:
-            called = f" {track.rpartition('-')[2]} at {elapsed[chosen]:.2f} s"
-            own = (node["position"] for node in graph["nodes"] if node["name"].endswith(called))
-            if (centre := next(own, None)) is None:
-                raise InputError(f"--track {track}: expected a track that is there at {elapsed[chosen]:.2f} s")
-        title = f"{scene}: the running graph at {elapsed[chosen]:.2f} s, with a frame of {graph['sensor']}"
-        return running_graph_picture(graph, title, centre)
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"expected graphs as --explain writes them: {error!r:.80}") from error
 
 
 def read_events(journal: Path) -> Iterator[Event]:

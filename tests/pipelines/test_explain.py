@@ -58,11 +58,6 @@ def test_tracks_and_graphs_that_are_not_there(folder, tmp_path, monkeypatch):
         (("--track", "1"), "expected --scene, the track is in a, b"),
         (("--track", "99"), "expected events of track 99, there are none"),
         (("--track", "car"), "expected the number of a track"),
-        (("--graph", "--output", "g.txt"), "ends in .png, .svg or .pdf"),
-        (("--graph", "--output", "g.png"), "--scene: expected one of those with graphs, a, b"),
-        (("--graph", "--output", "g.png", "--scene", "a", "--time", "9"), "expected 0 to 7.90 s after"),
-        (("--graph", "--output", "g.png", "--scene", "a", "--track", "9"), "--track 9: expected a track that is there"),
-        ((), "expected --track, or --graph"),
     ]:
         assert expected in refused("explain", folder / "tracks.csv", *arguments)
         assert not list(tmp_path.iterdir())
@@ -90,24 +85,6 @@ def test_an_event_that_nobody_wrote(folder, tmp_path):
             f"error: {tmp_path / 't.csv.journal.jsonl'}: expected events as --explain writes"
         )
         assert result.stdout == ""
-
-
-def test_the_running_graph_is_drawn(folder, tmp_path):
-    arguments = ("explain", folder / "tracks.csv", "--graph", "--time", "0.55", "--output")
-    done(*arguments, tmp_path / "g.svg", "--scene", "b")
-    drawn = (tmp_path / "g.svg").read_text()
-    for words in ("b: the running graph at 0.50 s", "car 1", "car 2", "interaction factor", "detection factor"):
-        assert f"<!-- {words}" in drawn
-    assert saga_fg(*arguments, tmp_path / "g.png", "--scene", "a", "--track", "2").exit_code == 0
-    assert (tmp_path / "g.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_a_graph_that_nobody_wrote(tmp_path):
-    for broken in ({"nodes": 3, "factors": []}, {"nodes": [], "factors": [{"kind": "initiation", "nodes": [4]}]}, {}):
-        event = {"scene": "a", "event": "graph", "time": 1.0, "sensor": "lidar", **broken}
-        (tmp_path / "t.csv.journal.jsonl").write_text(json.dumps(event) + "\n")
-        said = refused("explain", tmp_path / "t.csv", "--graph", "--output", tmp_path / "g.png")
-        assert "expected graphs as --explain writes them" in said
 
 
 def test_what_keeps_no_journal(folder, tmp_path):
