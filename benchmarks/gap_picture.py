@@ -19,7 +19,7 @@ from benchmarks.gap_runs import LivedRun, judged_run, judgement
 from benchmarks.recording_sets import RecordingSet
 from benchmarks.situations import colours_at
 from data_tools.files.atomic_files import write_bytes
-from data_tools.plots import COLOURS, ellipse, png
+from data_tools.plots import COLOURS, png
 from pipelines.learning.gaps import CAP, Contender, JudgedRun
 from saga_fg.errors import InputError
 from saga_fg.learning.gaps import Gap
@@ -147,8 +147,16 @@ def _draw_tracks(ax: Any, time: FloatArray, gap: Gap, shown: list[int], run: Jud
             places.append(run.tracks[k].boxes.position[row[0], :2])
             if gap.start < k < gap.stop and time[k] - time[gap.start] >= seconds - 1e-6:
                 seconds += 1.0
-                ring = places[-1] + ellipse(run.tracks[k].position_covariance[row[0]], RING)
+                ring = places[-1] + _ellipse(run.tracks[k].position_covariance[row[0]])
                 ax.plot(*turned(ring), color=colour, linewidth=1.0, alpha=0.8, zorder=5)
         if places:
             label = f"track {name}, 90 % ellipses"
             ax.plot(*turned(np.array(places)), "-o", color=colour, markersize=3, linewidth=1.2, zorder=6, label=label)
+
+
+def _ellipse(covariance: FloatArray) -> FloatArray:
+    """The ellipse (64, 2) of the probability `RING` of a position covariance (2, 2), about the origin."""
+    values, vectors = np.linalg.eigh(covariance)
+    angle = np.linspace(0.0, 2 * np.pi, 64)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.asarray(circle * np.sqrt(-2 * np.log(1 - RING) * np.maximum(values, 0.0)) @ vectors.T)

@@ -103,8 +103,8 @@ def error_json(errors: LabelErrors) -> dict[str, Any]:
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 
 
-def accuracy_charts(errors: LabelErrors) -> dict[str, list[Chart]]:
-    """Charts by name, if they have data: errors at labels by class, and the shares that the tracks' ellipses hold."""
+def accuracy_charts(errors: LabelErrors) -> list[Chart]:
+    """Charts, if they have data: errors at labels by class, and the shares that the tracks' ellipses hold."""
     classes = {name: of_class for name, of_class in errors_by_class(errors).items() if name != "overall"}
     charts = [
         distribution(
@@ -125,8 +125,7 @@ def accuracy_charts(errors: LabelErrors) -> dict[str, list[Chart]]:
         if len(known) >= FEWEST:
             held.append(Series(name, SHARES, list(coverages(known, SHARES).values())))
     calibrated = Chart("Calibration of positions", "share that the ellipse should hold", "share that it holds", held)
-    named = {"errors": [chart for chart in charts if chart.series], "calibration": [calibrated] * (len(held) > 1)}
-    return {name: found for name, found in named.items() if found}
+    return [chart for chart in charts if chart.series] + [calibrated] * (len(held) > 1)
 
 
 def recall_charts(curves: Mapping[str, RecallCurves]) -> list[Chart]:
@@ -449,9 +448,9 @@ class Evaluation:
             **({"own": self.own} if self.own else {}),
         }
 
-    def charts(self) -> dict[str, list[Chart]]:
-        """Charts by name: recall, errors, calibration, those that there are."""
-        return ({"recall": recall_charts(self.curves)} if self.curves else {}) | accuracy_charts(self.errors)
+    def charts(self) -> list[Chart]:
+        """Charts of recall, errors and calibration, those that there are."""
+        return [*recall_charts(self.curves), *accuracy_charts(self.errors)]
 
 
 def evaluate_tracks(

@@ -8,11 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.figures import Chart
 from saga_fg.numerics.arrays import FloatArray
 
 __all__ = [
-    "chart_picture",
     "new_figure",
     "occupancy_picture",
     "paths_from_above",
@@ -117,17 +115,4 @@ def occupancy_picture(probability: FloatArray, origin: FloatArray, cell: float, 
     ax.imshow(1 - probability.T, cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent, interpolation="nearest")
     ax.plot(path[:, 0], path[:, 1], color=COLOURS[0], linewidth=0.6)
     ax.set(aspect="equal", xlabel="x, m", ylabel="y, m")
-    return figure
-
-
-def chart_picture(charts: Sequence[Chart]) -> Any:
-    """Return a matplotlib `Figure` with a panel for each chart of curves."""
-    figure = new_figure(4.5 * len(charts), 4.5)
-    for ax, chart in zip(figure.subplots(1, len(charts), squeeze=False)[0], charts, strict=True):
-        for series in chart.series:
-            style = {"color": "black", "linewidth": 0.8} if series.faint else {"linewidth": 1.4}
-            ax.plot(series.x, series.y, label=series.name, **style)
-        ax.set(title=chart.title, xlabel=chart.x_label, ylabel=chart.y_label)
-        ax.grid(alpha=0.3)
-        ax.legend(frameon=False)
     return figure

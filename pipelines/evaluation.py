@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,7 @@ import numpy as np
 from data_tools.datasets.detection_files import read_tracks
 from data_tools.datasets.results import SceneResult, scene_result
 from data_tools.datasets.source import DatasetSource
-from data_tools.evaluation import accuracy_charts, placed_detections
+from data_tools.evaluation import placed_detections
 from data_tools.figures import FigureTable, cell, write_figures
 from data_tools.files.atomic_files import write_text
 from data_tools.metrics import SceneBoxes, coverages
@@ -294,6 +293,6 @@ def _page(source: DatasetSource, result: Path, found: Mapping[str, SceneResult],
             facts=facts,
             notes=[*notes, *some.notes],
             tables=list(evaluation.tables()),
-            charts=list(chain.from_iterable(accuracy_charts(evaluation.errors).values())),
+            charts=evaluation.charts(),
         )
     )

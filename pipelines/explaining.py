@@ -14,8 +14,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from data_tools.figures import FigureTable, count
 from data_tools.files.atomic_files import atomic_file
 from data_tools.files.input_files import open_bytes
@@ -23,7 +21,6 @@ from data_tools.files.readers import parsed_json
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import OnlineTracker
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking import SensorTime
 from saga_fg.tracking.journal import Event, Journal, of_scene
 
@@ -108,19 +105,6 @@ def read_track(journal: Path, track: str, scene: str | None) -> tuple[list[Event
     if len(scenes) > 1:
         raise InputError(f"--track {number}: expected --scene, the track is in {', '.join(scenes)}")
     return events, [event for event in clocks if str(event.get("scene")) == scenes[0]]
-
-
-def journal_innovations(journal: Path) -> dict[str, FloatArray]:
-    """Squared distances in sigmas of tracks and the detections they took, by class.
-
-    Raises `InputError` for a journal that is missing or broken.
-    """
-    found: dict[str, list[float]] = {}
-    for event in read_events(journal):
-        if event.get("event") == "matched":
-            chosen = next(c for c in event["candidates"] if c["outcome"] == "chosen")
-            found.setdefault(event["label"], []).append(chosen["distance2"])
-    return {label: np.array(values) for label, values in sorted(found.items())}
 
 
 def clock_lines(events: Sequence[Event]) -> list[str]:

@@ -14,8 +14,7 @@ from data_tools.datasets.detection_files import read_tracks
 from data_tools.datasets.results import Results
 from data_tools.datasets.source import DatasetSource, Innovations, input_files
 from data_tools.evaluation import LEGEND
-from data_tools.files.atomic_files import atomic_directory, write_text, write_zip
-from data_tools.plots import chart_picture, png
+from data_tools.files.atomic_files import write_text, write_zip
 from pipelines.checks import CheckedDataset, Checks
 from pipelines.cli import options
 from pipelines.cli.console import JsonFile, MarkdownFile, progress_bar, report, show_summary, show_tables, working
@@ -23,7 +22,6 @@ from pipelines.cli.options import ScaleOptions, TrackerOptions, dataset_commands
 from pipelines.cli.track import exit_on_failures, run_at_scale
 from pipelines.config import Method, TrackConfig
 from pipelines.evaluation import evaluate_labels, judge_run
-from pipelines.explaining import journal_innovations, journal_of
 from pipelines.scale_out import TrackTask
 from pipelines.smoothing import load_smooth_config
 from pipelines.tracking import InnovationRecorder, track_dataset
@@ -35,10 +33,6 @@ class EvaluationOptions:
     """Which figures are made, and what they are written to."""
 
     hota: Annotated[bool, typer.Option("--hota", help="HOTA, CLEAR and Identity too (needs the extra [eval]).")] = False
-    innovations: Annotated[
-        bool,
-        typer.Option("--innovations", help="How well innovations fit (NIS), from the journal beside the result."),
-    ] = False
     metric: Annotated[
         list[str] | None,
         typer.Option("--metric", help="Metric of your own: MODULE:NAME, or an installed entry point.", metavar="NAME"),
@@ -46,10 +40,6 @@ class EvaluationOptions:
     full: Annotated[bool, typer.Option("--full", help="Print all tables, not the summary alone.")] = False
     json_file: JsonFile = None
     markdown: MarkdownFile = None
-    plots: Annotated[
-        Path | None,
-        typer.Option("--plots", help="Folder to draw recall sweeps, calibration and errors to.", metavar="DIR"),
-    ] = None
 
 
 def _evaluate(
@@ -74,16 +64,15 @@ def _evaluate(
         mend = own if source.truth_option else "score a table: saga-fg evaluate file tracks.csv --truth TABLE"
         raise InputError(f"evaluate {source.name}: expected ground truth, there is none; {mend}")
     if result is None:
-        found, nis = _tracked(source, tracker.configured(source.family, config), tracker.method)
+        found, innovations = _tracked(source, tracker.configured(source.family, config), tracker.method)
     else:
         given = {name: value for name, value in vars(tracker).items() if value != getattr(TrackerOptions, name)}
         for name, value in (given | ({} if config is None else {"config": config})).items():
             raise InputError(f"--{name} {value}: goes without a result, which is made by it")
         with working("reading"):
-            found = source.read_results(result)
-            nis = journal_innovations(journal_of(result)) if shown.innovations else {}
+            found, innovations = source.read_results(result), {}
     with working("scoring"):
-        evaluation = found.evaluate(shown.hota, nis, shown.metric or ())
+        evaluation = found.evaluate(shown.hota, innovations, shown.metric or ())
     summary = evaluation.summary()
     if summary is not None:
         show_summary(summary, LEGEND)
@@ -92,10 +81,6 @@ def _evaluate(
     report(tables if shown.full or summary is None else named, evaluation.figures(), shown.json_file)
     if shown.markdown is not None:
         write_text(shown.markdown, "\n".join(table.markdown() for table in (*([summary] if summary else ()), *tables)))
-    if shown.plots is not None:
-        with atomic_directory(shown.plots, known=("recall.png", "errors.png", "calibration.png")) as folder:
-            for name, charts in evaluation.charts().items():
-                (folder / f"{name}.png").write_bytes(png(chart_picture(charts)))
 
 
 def _tracked(source: DatasetSource, settings: TrackConfig, method: Method) -> tuple[Results, Innovations]:
@@ -142,7 +127,7 @@ evaluate_app = dataset_commands(
     _evaluate,
     (
         "evaluate {result}",
-        "evaluate {result} --hota --json figures.json --plots plots",
+        "evaluate {result} --hota --json figures.json",
         "evaluate {recordings} --method kf",
     ),
     lambda source: {} if source.summarised else {"full": None},

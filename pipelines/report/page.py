@@ -18,7 +18,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from importlib.resources import files
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,6 @@ import numpy as np
 from data_tools.datasets.detection_files import read_predictions
 from data_tools.datasets.results import Results
 from data_tools.datasets.source import DatasetSource
-from data_tools.evaluation import accuracy_charts
 from data_tools.figures import Chart, FigureTable, as_json
 from data_tools.files.atomic_files import write_text
 from data_tools.files.input_files import read_bytes
@@ -293,6 +291,6 @@ def result_figures(found: Results, with_truth: bool) -> tuple[list[FigureTable],
     """Tables and charts of a result: of its errors beside ground truth, else of the tracks alone."""
     if with_truth:
         evaluation = found.evaluate()
-        return list(evaluation.tables()), list(chain.from_iterable(accuracy_charts(evaluation.errors).values()))
+        return list(evaluation.tables()), evaluation.charts()
     results = list(found.scenes.values())
     return [track_figures(results)], track_charts(results)

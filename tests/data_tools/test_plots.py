@@ -7,21 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.evaluation import recall_charts
-from data_tools.figures import Chart, FigureTable, Series, as_json, cell, count, write_figures
+from data_tools.figures import FigureTable, as_json, cell, count, write_figures
 from data_tools.metrics import RecallCurves
-from data_tools.plots import chart_picture, png
-
-
-def test_a_chart_is_drawn_as_it_is():
-    chart = Chart(
-        "Errors", "m", "share", [Series("right", (0, 1), (0, 1), faint=True), Series("car", (0, 2), (0, 0.5))]
-    )
-    figure = chart_picture([chart, chart])
-    for ax in figure.axes:
-        right, car = ax.lines
-        assert (ax.get_title(), right.get_color(), car.get_label()) == ("Errors", "black", "car")
-        assert car.get_xydata().tolist() == [[0, 0], [2, 0.5]]
-    assert png(figure).startswith(b"\x89PNG")
 
 
 def test_recall_charts_leave_out_what_is_not_reached():

@@ -35,8 +35,6 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_nuscenes_figures_are_those_of_the_metrics(drive, tmp_path):
     file = tmp_path / "figures.json"
-    (tmp_path / "plots").mkdir()
-    (tmp_path / "plots" / "calibration.png").write_text("of an earlier run")
     result = done(
         "evaluate",
         "nuscenes",
@@ -47,10 +45,7 @@ def test_nuscenes_figures_are_those_of_the_metrics(drive, tmp_path):
         "drive",
         "--json",
         file,
-        "--plots",
-        tmp_path / "plots",
     )
-    assert {path.name for path in (tmp_path / "plots").iterdir()} == {"recall.png", "errors.png"}
     metrics = nuscenes_tracking_metrics(
         [each.tracking for each in read_scored_scenes(drive / "result.json", drive, VERSION).values()]
     )
@@ -88,10 +83,6 @@ def test_what_cannot_be_judged_is_refused(drive, tmp_path):
     (tmp_path / "short.json").write_text(json.dumps(content))
     said = refused("evaluate", "nuscenes", tmp_path / "short.json", "--dataroot", drive, "--split", "drive")
     assert "scene-0-3 is missing" in said
-    said = refused(
-        "evaluate", "nuscenes", drive / "result.json", "--dataroot", drive, "--split", "drive", "--innovations"
-    )
-    assert "track with --explain" in said
 
 
 def test_nuscenes_hota_and_errors_on_the_labels_that_detections_match(tmp_path):
@@ -102,8 +93,8 @@ def test_nuscenes_hota_and_errors_on_the_labels_that_detections_match(tmp_path):
     of_data = ("--dataroot", data, "--split", "all", "--detections", lidar)
     for command in (
         ("simulate", "-o", data, "--scenes", "1", "--config", tmp_path / "short.yaml"),
-        ("track", "nuscenes", *of_data, "-o", tracks, "--explain"),
-        ("evaluate", "nuscenes", tracks, *of_data, "--hota", "--innovations", "--json", file),
+        ("track", "nuscenes", *of_data, "-o", tracks),
+        ("evaluate", "nuscenes", tracks, *of_data, "--hota", "--json", file),
     ):
         result = done(*command)
     figures = json.loads(file.read_text())
@@ -114,7 +105,6 @@ def test_nuscenes_hota_and_errors_on_the_labels_that_detections_match(tmp_path):
     assert 0 < figures["calibration"]["overall"]["coverage"]["0.9"] <= 1
     assert figures["hota"]["car"]["2D"]["hota"] >= figures["hota"]["car"]["3D"]["hota"] > 0.2
     assert "HOTA, CLEAR and Identity" in result.stdout
-    assert figures["innovations"]["car"]["matches"] > 20
 
 
 def test_kitti_labels_as_results_are_perfect(tmp_path):

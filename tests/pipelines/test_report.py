@@ -142,7 +142,7 @@ def test_charts_say_what_the_errors_are():
     truth = SceneBoxes(moment, np.full(n, "a"), truth_boxes, np.zeros(n))
     found = SceneBoxes(moment, np.full(n, "t"), found_boxes, np.ones(n), covariance)
     charts = accuracy_charts(label_errors(truth, found, np.zeros((n, 2))))
-    (position, velocity, heading), (held,) = charts["errors"], charts["calibration"]
+    position, velocity, heading, held = charts
     series = position.series[0]
     assert np.interp(0.5, series.y, series.x) == pytest.approx(np.median(np.hypot(*error.T)), abs=0.01)
     assert velocity.title.startswith("Velocity")

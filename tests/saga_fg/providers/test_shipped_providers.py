@@ -7,28 +7,20 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import gaussian_factor, interaction_factor, prior_factor
-from saga_fg import ConstantVelocity, Detection, Detections, Frame, InputError, Sensor, Tracker, TrackerSettings
+from saga_fg import Detections, Frame, InputError
 from saga_fg.estimators import BatchSolver, IncrementalSmoother
 from saga_fg.graph import (
     EGO_BIAS,
     EGO_POSE,
     EGO_VELOCITY,
     LANDMARK,
-    MAP_NODE,
-    OBJECT,
-    Additions,
     GraphError,
-    NewVariable,
 )
 from saga_fg.model.landmarks import PointLandmark
-from saga_fg.model.sensor import NoiseModel
-from saga_fg.providers import Gps, Imu, Landmarks, LaneKeeping, Odometry, StartSettings, StationaryObjects
+from saga_fg.providers import Gps, Imu, Landmarks, Odometry, StartSettings
 from saga_fg.providers.navigation import GRAVITY
-from saga_fg.tracking import ClassSettings
 from saga_fg.types.frame import EgoMeasurements, GpsFix, ImuSamples, OdometryIncrement
 from saga_fg.types.landmark import Observation
-from saga_fg.types.road_map import Lane
 
 DT = 0.1
 START = (5.0, -3.0, 0.4)
@@ -187,72 +179,6 @@ def test_the_antenna_says_where_the_vehicle_points():
     heading, known = (s.covariance(now(s, EGO_POSE)) for s in (smoother, loose))
     assert known[2, 2] == pytest.approx(0.01)
     assert heading[1, 2] < -1e-3, "the place hangs on the heading"
-
-
-class Parked:
-    """An object seen every epoch, which drives off after two seconds."""
-
-    name = "parked"
-
-    def __init__(self, label: str) -> None:
-        self.label = label
-
-    def factors(self, view: Any) -> Additions:
-        key, before = view.key(OBJECT, 1), view.before(OBJECT)
-        F, state = np.eye(4) + view.dt * np.eye(4, k=2), np.zeros(4)
-        if before:
-            state = F @ view.state(before[1].key)
-            Q = np.kron([[view.dt**3 / 3, view.dt**2 / 2], [view.dt**2 / 2, view.dt]], np.eye(2))
-            start = interaction_factor(key, [before[1].key], [F], np.zeros(4), Q)
-        else:
-            start = prior_factor(key, state, np.eye(4))
-        z = np.array([max(0.0, 5 * (view.time - 2)), 0.0]) + 0.2 * np.sin([7.3 * view.epoch, 3.1 * view.epoch])
-        seen = gaussian_factor([key], [np.eye(2, 4)], z, 0.04 * np.eye(2))
-        return Additions([NewVariable(OBJECT, 1, state, label=self.label)], [start, seen])
-
-
-def test_what_stands_is_held_until_it_drives_off():
-    speeds = {}
-    for label in ("barrier", "car"):
-        smoother = IncrementalSmoother([Parked(label), StationaryObjects()])
-        speeds[label] = []
-        for k in range(40):
-            smoother.step(DT * k)
-            key = smoother.graph().of(OBJECT, k)[1].key
-            speeds[label].append(float(np.hypot(*smoother.state(key)[2:])))
-    standing, driving = (np.array(speeds[label]) for label in ("barrier", "car"))
-    assert standing[10:20].max() < 0.3 * driving[10:20].max()
-    assert standing[-1] == pytest.approx(5.0, abs=1.0), "it drives"
-
-
-def test_vehicles_keep_to_a_lane_that_the_map_has_too_far_left():
-    """The map is off by 0.6 m: three cars that are seen well tell so, and a fourth, seen badly, is held to the lane."""
-    lane = Lane("main", ((100.0, 50.6), (400.0, 50.6)), 4.0)
-    settings = TrackerSettings(estimator="isam2", edges=(), classes={"default": ClassSettings(motion=STEADY)})
-    sensors = {"sharp": Sensor(noise={"default": NoiseModel(position=0.1)})}
-    sensors["dull"] = Sensor(noise={"default": NoiseModel(position=2.0)}, use_velocity=False)
-    off = {}
-    for providers in ((), (LaneKeeping((lane,), deviation=0.3, map_deviation=1.0),)):
-        rng = np.random.default_rng(2)
-        tracker = Tracker(settings, sensors, providers=[*providers, StationaryObjects()])
-        for k in range(60):
-            cars = np.stack([110 + 0.8 * k + 30 * np.arange(4.0), np.full(4, 50.0)], axis=1)
-            tracker.step(seen_at(0.1 * k, "sharp", cars[:3] + rng.normal(0, 0.1, (3, 2))))
-            tracks = tracker.step(seen_at(0.1 * k, "dull", cars[3:] + rng.normal(0, 1.0, (1, 2))))
-        off[len(providers)] = np.abs(tracks.boxes.position[:, 1] - 50.0)
-    assert off[1][3] < 0.5 * off[0][3]
-    assert off[1][:3].max() < 0.15
-    graph = tracker.snapshot().joint[0].graph
-    (line,) = graph.of(MAP_NODE, None).values()
-    assert str(line) == "lane main 0"
-    assert graph.state(line.key) == pytest.approx([-0.6], abs=0.15)
-
-
-STEADY = ConstantVelocity(acceleration_noise=0.2)
-
-
-def seen_at(time: float, sensor: str, places: np.ndarray) -> Frame:
-    return Frame(time, sensor, Detections.of([Detection("car", (x, y, 0.8), score=0.9) for x, y in places]))
 
 
 IMU = ImuSamples([0.1], [[0, 0, 9.81]], [[0, 0, 0]])
