@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,21 +21,17 @@ from data_tools.metrics.labels import (
     CommonBoxes,
     LabelledScene,
     PrecisionRecall,
-    SelfConsistency,
     common_boxes,
     precision_recall,
     scored_pairs,
-    self_consistency,
 )
 from pipelines.config import Method
 from pipelines.report import report_page, result_report
 from pipelines.report.page import RunRecord, write_run_record
 from pipelines.smoothing import SmoothConfig
 from pipelines.tracking import Progress, track_scene
-from saga_fg import Boxes, Dataset, InputError, Scene
+from saga_fg import Dataset, InputError, Scene
 from saga_fg.model.sensor import sensor_model
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.smoothing import gather_evidence
 
 if TYPE_CHECKING:
     from data_tools.evaluation import Evaluation
@@ -50,22 +46,17 @@ SYSTEMS = ("detections", "online", "labels")
 class LabelEvaluation:
     """The figures of labels over some scenes.
 
-    curves       by distance (m) and system; empty without ground truth
-    same         by distance: the true boxes that all systems match
-    consistency  by system
+    curves  by distance (m) and system
+    same    by distance: the true boxes that all systems match
     """
 
     scenes: tuple[str, ...]
     curves: Mapping[float, Mapping[str, PrecisionRecall]]
     same: Mapping[float, CommonBoxes]
-    consistency: Mapping[str, SelfConsistency]
 
     def tables(self) -> list[FigureTable]:
         """Tables for people."""
-        tables = [] if not self.curves else [_recall_table(self.curves), *map(_group_table, self._groups())]
-        if self.same:
-            tables.append(_calibration_table(self.same[2.0]))
-        return [*tables, _consistency_table(self.consistency)]
+        return [_recall_table(self.curves), *map(_group_table, self._groups()), _calibration_table(self.same[2.0])]
 
     def figures(self) -> dict[str, Any]:
         """Figures for programs."""
@@ -85,13 +76,10 @@ class LabelEvaluation:
             "common_boxes": {
                 title: {group: _json_of(boxes) for group, boxes in groups.items()} for title, groups in self._groups()
             },
-            "consistency": {name: asdict(value) for name, value in self.consistency.items()},
         }
 
     def _groups(self) -> list[tuple[str, dict[str, CommonBoxes]]]:
         """Tables of the same boxes: by distance of the match, class, range, and whether they could be seen."""
-        if not self.same:
-            return []
         visible = {d: same.select(same.visible) for d, same in self.same.items()}
         wide = visible[2.0]
         far = {f"{a:g} to {b:g} m": wide.select((wide.distance >= a) & (wide.distance < b)) for a, b in RANGES}
@@ -114,50 +102,34 @@ def evaluate_labels(
     """Judge a table of labels by the dataset it was made of; the online tracks are made anew, as `config` says.
 
     The scenes are those in the table. Raises `InputError` for a table that is missing, broken or empty, and for
-    scenes and moments that the dataset does not have.
+    scenes and moments that the dataset does not have, or without ground truth.
     """
     rows = read_tracks(table, labels=True)
     if len(rows.source) == 0:
         raise InputError(f"{table}: expected labels, there are none")
-    scenes: list[str] = []
-    timestamps: list[FloatArray] = []
-    labelled: list[LabelledScene] = []
-    parts: dict[str, list[SceneBoxes]] = {name: [] for name in SYSTEMS}
-    seen: list[tuple[IntArray, Boxes, FloatArray]] = []
+    labelled: dict[str, LabelledScene] = {}
     for name in np.unique(rows.scene).tolist():
         scene = dataset.scene(name)
+        if scene.ground_truth is None:
+            raise InputError(f"scene {name}: expected ground truth, there is none")
         online = track_scene(scene, config.tracking.new_tracker(method), progress)
         systems = {
             "detections": _detections(scene, config),
             "online": SceneBoxes.of_tracks(online.tracks),
             "labels": scene_result(scene, rows, table).found,
         }
-        first = len(np.concatenate([np.empty(0), *timestamps]))
-        for system, found in systems.items():
-            parts[system].append(_moved(found, first, name))
-        seen.append(_noise(scene, config, first))
-        timestamps.append(scene.timestamps)
-        scenes.append(name)
-        if scene.ground_truth is not None:
-            labelled.append(_labelled(scene, systems))
-    times = np.concatenate([np.empty(0), *timestamps])
-    moment, boxes, R = zip(*seen, strict=True)
-    noise = np.concatenate(moment), Boxes.concatenate(boxes), np.concatenate(R)
-    consistency = {
-        name: self_consistency(SceneBoxes.concatenate(parts[name]), times, noise) for name in ("online", "labels")
-    }
+        labelled[name] = _labelled(scene, systems)
     curves: dict[float, dict[str, PrecisionRecall]] = {}
     same: dict[float, CommonBoxes] = {}
-    if len(labelled) == len(scenes):
-        for distance in DISTANCES:
-            curves[distance] = {
-                system: precision_recall(
-                    [scored_pairs(s.truth, s.visible, s.systems[system], distance) for s in labelled]
-                )
-                for system in SYSTEMS
-            }
-            same[distance] = CommonBoxes.concatenate([common_boxes(scene, distance) for scene in labelled])
-    return LabelEvaluation(tuple(scenes), curves, same, consistency)
+    for distance in DISTANCES:
+        curves[distance] = {
+            system: precision_recall(
+                [scored_pairs(s.truth, s.visible, s.systems[system], distance) for s in labelled.values()]
+            )
+            for system in SYSTEMS
+        }
+        same[distance] = CommonBoxes.concatenate([common_boxes(scene, distance) for scene in labelled.values()])
+    return LabelEvaluation(tuple(labelled), curves, same)
 
 
 def _detections(scene: Scene, config: SmoothConfig) -> SceneBoxes:
@@ -174,16 +146,6 @@ def _detections(scene: Scene, config: SmoothConfig) -> SceneBoxes:
     return SceneBoxes(moment, np.arange(len(boxes)).astype(np.str_), boxes, np.concatenate([np.empty(0), *scores]))
 
 
-def _noise(scene: Scene, config: SmoothConfig, first: int) -> tuple[IntArray, Boxes, FloatArray]:
-    """Moment, boxes and noise R (M, 2, 2) of the usable detections at the scene's moments, which count from `first`."""
-    evidence = gather_evidence(scene.frames, scene.timestamps, config.sensors, config.tracking.tracker.classes)
-    at = np.searchsorted(scene.timestamps, evidence.times[evidence.moment])
-    there = np.flatnonzero(np.isin(evidence.times[evidence.moment], scene.timestamps))
-    boxes = evidence.boxes.select(there)
-    world = replace(boxes, position=boxes.position + np.append(evidence.origin, 0.0))
-    return at[there] + first, world, evidence.R[there, :2, :2]
-
-
 def _labelled(scene: Scene, systems: Mapping[str, SceneBoxes]) -> LabelledScene:
     assert scene.ground_truth is not None
     truth = SceneBoxes.of_annotations(scene.ground_truth)
@@ -191,12 +153,6 @@ def _labelled(scene: Scene, systems: Mapping[str, SceneBoxes]) -> LabelledScene:
     place = scene.world_T_ego[truth.frame][:, :2, 3]
     distance = np.hypot(*(truth.boxes.position[:, :2] - place).T)
     return LabelledScene(truth, visible, truth.boxes.velocity, distance, systems)
-
-
-def _moved(table: SceneBoxes, first: int, scene: str) -> SceneBoxes:
-    """Boxes with frames counted from `first` on and ids that name the scene."""
-    names = np.array([f"{scene}/{name}" for name in table.id.tolist()], dtype=np.str_)
-    return replace(table, frame=table.frame + first, id=names)
 
 
 def _recall_table(curves: Mapping[float, Mapping[str, PrecisionRecall]]) -> FigureTable:
@@ -243,15 +199,6 @@ def _calibration_table(same: CommonBoxes) -> FigureTable:
             rows.append((f"{label}, {name}", cell(len(values)), mean, *covered))
     columns = ("class", "boxes", "ANEES / 2", "in 50 %", "in 90 %", "in 99 %")
     return FigureTable("Calibration: share of position errors within the stated ellipses", columns, tuple(rows))
-
-
-def _consistency_table(consistency: Mapping[str, SelfConsistency]) -> FigureTable:
-    columns = (
-        *("system", "objects", "boxes", "frames each", "jerkiness, m/s^2", "turned", "resized, m", "gaps"),
-        "residual",
-    )
-    rows = tuple((name, *(cell(v) for v in asdict(value).values())) for name, value in consistency.items())
-    return FigureTable("Self-consistency, without ground truth", columns, rows)
 
 
 def _json_of(same: CommonBoxes) -> dict[str, Any]:

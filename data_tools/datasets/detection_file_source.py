@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from saga_fg.numerics.arrays import FloatArray
     from saga_fg.types.finding import Mend
 
-JUDGED: tuple[Verb, ...] = ("evaluate", "report", "view")
+JUDGED: tuple[Verb, ...] = ("evaluate", "evaluate labels", "report", "view")
 """Verbs that compare with true objects."""
 
 

@@ -59,10 +59,7 @@ def _evaluate(
     The scenes scored are those of the result, or those that are named.
     Where detections are given and the metrics are official, errors are those at the labels that detections match.
     """
-    if not source.has_truth:
-        own = f"name it: {source.truth_option} TABLE"
-        mend = own if source.truth_option else "score a table: saga-fg evaluate file tracks.csv --truth TABLE"
-        raise InputError(f"evaluate {source.name}: expected ground truth, there is none; {mend}")
+    _require_truth(source)
     if result is None:
         found, innovations = _tracked(source, tracker.configured(source.family, config), tracker.method)
     else:
@@ -83,6 +80,13 @@ def _evaluate(
         write_text(shown.markdown, "\n".join(table.markdown() for table in (*([summary] if summary else ()), *tables)))
 
 
+def _require_truth(source: DatasetSource) -> None:
+    if not source.has_truth:
+        own = f"name it: {source.truth_option} TABLE"
+        mend = own if source.truth_option else "score a table: saga-fg evaluate file tracks.csv --truth TABLE"
+        raise InputError(f"evaluate {source.name}: expected ground truth, there is none; {mend}")
+
+
 def _tracked(source: DatasetSource, settings: TrackConfig, method: Method) -> tuple[Results, Innovations]:
     """Track all scenes, write the result and read it back; and the innovations of the tracker."""
     checks = Checks(settings.of_method(method), option_for=source.option_for)
@@ -99,9 +103,6 @@ def _tracked(source: DatasetSource, settings: TrackConfig, method: Method) -> tu
 def _evaluate_labels(
     source: DatasetSource,
     result: Annotated[Path, typer.Argument(help="Folder that `saga-fg smooth` wrote, or its table of boxes.")],
-    without_truth: Annotated[
-        bool, typer.Option("--without-truth", help="Self-consistency only, as where nobody has labelled.")
-    ] = False,
     method: options.MethodOption = "saga",
     config: options.Config = None,
     json_file: JsonFile = None,
@@ -109,14 +110,15 @@ def _evaluate_labels(
 ) -> None:
     """Judge labels beside the online tracks and the detections: recall, errors on the same boxes, calibration.
 
-    The scenes are those in the table. Without ground truth, the figures say how smooth the labels are and how well they
-    agree with the detections.
+    The scenes are those in the table. Where nobody has labelled, the columns p_exists, p_class, p_identity and
+    p_heading of the labels, and review.csv, say how sure they are.
     """
+    _require_truth(source)
     table = _table(result)
     scenes = np.unique(read_tracks(table, labels=True).scene).tolist()
     settings = load_smooth_config(source.family, config)
     chosen = source.restricted(scenes) if scenes else source
-    with chosen.open(source.has_truth and not without_truth) as dataset, progress_bar(len(scenes)) as progress:
+    with chosen.open(truth=True) as dataset, progress_bar(len(scenes)) as progress:
         evaluation = evaluate_labels(table, dataset, settings, method, progress)
     report(evaluation.tables(), evaluation.figures(), json_file)
 
@@ -138,6 +140,7 @@ labels_app = dataset_commands(
     "Judge labels that `saga-fg smooth` made, beside the online tracks and the detections.",
     _evaluate_labels,
     ("evaluate labels {result}",),
+    listed=lambda source: source.has_truth or bool(source.truth_option),
 )
 evaluate_app.add_typer(labels_app, name="labels")
 

@@ -93,24 +93,23 @@ def test_labels_are_judged_beside_online_tracks_and_detections(tmp_path):
     )
     arguments = ["evaluate", "labels", "simulated", str(tmp_path / "labels"), "--seed", "9"]
     run = done(*arguments, "--simulator", _short(tmp_path), "--method", "kf")
-    for title in ("Precision and recall", "by class", "by range", "by occlusion", "Calibration", "Self-consistency"):
+    for title in ("Precision and recall", "by class", "by range", "by occlusion", "Calibration"):
         assert title in run.output
 
 
-def test_labels_of_a_file_are_judged_without_truth(tmp_path):
-    table = tmp_path / "detections.csv"
-    rows = [f"{0.1 * k:.1f},{k}.0,0.0,4.5,1.9,1.6,0.0,car,0.9" for k in range(15)]
-    table.write_text("timestamp,x,y,length,width,height,yaw,label,score\n" + "\n".join(rows) + "\n")
+def test_labels_of_a_table_are_judged_by_a_table_of_truth(tmp_path):
+    table, truth, figures = (tmp_path / name for name in ("detections.csv", "truth.csv", "figures.json"))
+    boxes = [f"{0.1 * k:.1f},{k}.0,0.0,4.5,1.9,1.6,0.0,car" for k in range(15)]
+    columns = "timestamp,x,y,length,width,height,yaw,label"
+    table.write_text(f"{columns},score\n" + "".join(f"{row},0.9\n" for row in boxes))
+    truth.write_text(f"{columns},id\n" + "".join(f"{row},a\n" for row in boxes))
     done("smooth", "file", table, "-o", tmp_path / "labels")
-    figures = tmp_path / "figures.json"
-    labels = ["evaluate", "labels", "file", str(tmp_path / "labels")]
-    done(*labels, "--detections", table, "--json", figures)
-    found = json.loads(figures.read_text())
-    assert found["precision_recall"] == {}
-    assert found["consistency"]["labels"]["boxes"] == 15
-    assert found["consistency"]["labels"]["jerkiness"] < 1.0
-    said = refused("evaluate", "labels", "file", tmp_path / "nothing", "--detections", table)
-    assert "expected a folder that `saga-fg smooth` wrote" in said
+    labels = ["evaluate", "labels", "file", tmp_path / "labels", "--detections", table]
+    assert "expected ground truth, there is none; name it: --truth TABLE" in refused(*labels)
+    done(*labels, "--truth", truth, "--json", figures)
+    assert json.loads(figures.read_text())["precision_recall"]["2.0"]["labels"]["whole"] == [1.0, 1.0]
+    labels[3] = tmp_path / "nothing"
+    assert "expected a folder that `saga-fg smooth` wrote" in refused(*labels, "--truth", truth)
 
 
 def _short(folder: Path) -> Path:

@@ -22,7 +22,6 @@ from data_tools.metrics.labels import (
     common_boxes,
     precision_recall,
     scored_pairs,
-    self_consistency,
 )
 from data_tools.metrics.scene_boxes import nearest_pairs
 from saga_fg import Boxes
@@ -213,27 +212,3 @@ def test_a_box_stays_with_its_object():
     systems = {"one": label_table([0, 0, 1, 1, 2], ["1", "2", "1", "2", "2"], [0.1, 1.5, 0.1, 1.5, 1.5])}
     same = common_boxes(LabelledScene(truth, np.ones(5, dtype=bool), np.zeros((5, 2)), np.zeros(5), systems), 2.0)
     assert same.sample("one", "position").values.tolist() == pytest.approx([0.1, 0.0, 0.1, 0.0])
-
-
-def test_self_consistency_sees_jumps_turns_and_gaps():
-    times = np.arange(5) * 0.5
-    steady = self_consistency(label_table([0, 1, 2, 3, 4], ["1"] * 5, [0.0, 1.0, 2.0, 3.0, 4.0]), times)
-    assert (steady.objects, steady.boxes, steady.turned, steady.gaps) == (1, 5, 0.0, 0.0)
-    assert steady.jerkiness == pytest.approx(0.0, abs=1e-12)
-    restless = self_consistency(
-        label_table([0, 1, 3, 4], ["1"] * 4, [0.0, 1.0, 0.0, 4.0], yaw=[0.0, 3.1, 3.1, 0.0]), times
-    )
-    assert restless.turned == pytest.approx(2 / 3)
-    assert restless.gaps == pytest.approx(1 / 5)
-    assert restless.jerkiness > 3.0
-
-
-def test_the_residual_is_one_for_detections_around_the_truth():
-    rng = np.random.default_rng(0)
-    found = label_table([0] * 500, [str(k) for k in range(500)], (10.0 * np.arange(500)).tolist())
-    sigma = 0.3
-    noise = np.column_stack([rng.normal(0, sigma, (500, 2)), np.zeros(500)])
-    boxes = Boxes.of(["car"] * 500, found.boxes.position + noise)
-    R = np.tile(sigma**2 * np.eye(2), (500, 1, 1))
-    figures = self_consistency(found, np.zeros(1), (np.zeros(500, dtype=np.int64), boxes, R))
-    assert figures.residual == pytest.approx(1.0, abs=0.15)
