@@ -29,7 +29,7 @@ import typer
 
 from benchmarks.runner import PROGRAM, Rows, Seed, chosen, each
 from data_tools.files.atomic_files import LEFTOVER
-from pipelines.scale_out.results import OF_THE_RUN
+from pipelines.scale_out.run import OF_THE_RUN
 
 RECORDINGS = (
     "nuscenes",

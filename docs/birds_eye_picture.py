@@ -13,8 +13,7 @@ from pipelines.config import TrackConfig
 from pipelines.demo import TITLES, Comparison, hardest_moment
 from pipelines.report import scene_of_run
 from pipelines.view import SceneView, draw_scene
-from pipelines.view.drawing import Arrows, Drawing, Lines, Pose, Solids
-from pipelines.view.scenes import EDGE
+from pipelines.view.scenes import EDGE, Arrows, Drawing, Lines, Pose, Solids
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
 

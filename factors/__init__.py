@@ -12,6 +12,8 @@ from factors.gaussian import (
     gaussian_factor,
     gaussian_factors,
     gaussian_graph,
+    interaction_factor,
+    interaction_factors,
     joint_prior_factor,
     marginal_factors,
     marginal_moments,
@@ -19,7 +21,6 @@ from factors.gaussian import (
     prior_factor,
     prior_factors,
 )
-from factors.interaction import interaction_factor, interaction_factors
 from factors.lines_and_planes import HesseLine, line_factors, plane, plane_factor
 from factors.manifolds import ImuBias, OrientedPlane, PlanarPose, SpatialPose, Variable, Vector
 from factors.measurement import (

@@ -8,7 +8,7 @@ from .model.scene_graph import Edges, SceneGraph
 from .model.sensor import Sensor
 from .smoothing import smooth
 from .tables.column_names import TableImport
-from .tables.data_frames import frames_of
+from .tables.detections import frames_of
 from .tracking import GreedyTracker, IdentityTracker, Tracker, TrackerSettings, track
 from .types.boxes import Boxes
 from .types.dataset import Annotations, Dataset, Scene

@@ -14,8 +14,7 @@ from data_tools.datasets.results import Results, SceneResult, clear_figures, tab
 from data_tools.evaluation import Evaluation, Metric
 from saga_fg.tables.column_names import TableImport
 from saga_fg.tables.columns import SETTLED, TRACK_COLUMNS
-from saga_fg.tables.data_frames import NAME, Table, raw_table, tell
-from saga_fg.tables.detections import DetectionTable
+from saga_fg.tables.detections import NAME, DetectionTable, Table, raw_table, tell
 from saga_fg.types.dataset import Dataset
 
 _DEPTH = 6  # callers between a warning and the program

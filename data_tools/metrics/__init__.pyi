@@ -1,4 +1,3 @@
-from .error_sample import ErrorSample, coverage, coverages, nees
 from .hota import HotaMetrics, hota_metrics
 from .kitti_tracking import (
     KittiSimilarity,
@@ -9,13 +8,17 @@ from .kitti_tracking import (
 )
 from .label_errors import (
     EllipseCoverage,
+    ErrorSample,
     ErrorSummary,
     LabelErrors,
     calibration,
+    coverage,
+    coverages,
     error_summary,
     errors_by_class,
     label_errors,
     label_velocities,
+    nees,
 )
 from .nuscenes_sweep import NuScenesClassMetrics, RecallCurves
 from .nuscenes_tracking import (

@@ -55,7 +55,7 @@ from data_tools.metrics.kitti_boxes import (
     kitti_hota_metrics,
     true_boxes,
 )
-from data_tools.metrics.matching import Candidates, best_pairs, optimal_pairs
+from data_tools.metrics.scene_boxes import Candidates, best_pairs, optimal_pairs
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.types.boxes import paired_iou_3d
 

@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from data_tools.metrics.error_sample import ErrorSample, nees
+from data_tools.metrics.label_errors import ErrorSample, nees
 from data_tools.metrics.scene_boxes import SceneBoxes, near_pairs, nearest_pairs
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
 from saga_fg.numerics.geometry import wrap_angle

@@ -45,8 +45,7 @@ from typing import Self
 
 import numpy as np
 
-from data_tools.metrics.matching import Candidates, optimal_pairs
-from data_tools.metrics.scene_boxes import SceneBoxes
+from data_tools.metrics.scene_boxes import Candidates, SceneBoxes, optimal_pairs
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
 from saga_fg.types.boxes import Boxes
 

@@ -39,9 +39,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from data_tools.metrics.error_sample import ErrorSample, nees
-from data_tools.metrics.matching import Candidates, best_pairs
-from data_tools.metrics.scene_boxes import SceneBoxes
+from data_tools.metrics.label_errors import ErrorSample, nees
+from data_tools.metrics.scene_boxes import Candidates, SceneBoxes, best_pairs
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.numerics.geometry import wrap_angle

@@ -6,18 +6,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_tools.simulator.fleet import (
+from data_tools.simulator.road import (
     CAR,
     KINDS,
     TRUCK,
     VAN,
     Fleet,
+    Lanes,
+    Road,
     attach_trailers,
+    curved_road,
     equilibrium_gap,
     sample_fleet,
     sample_sizes,
 )
-from data_tools.simulator.road import Lanes, Road, curved_road
 from data_tools.simulator.settings import SimulatorSettings, TrafficSettings
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
 from saga_fg.types.boxes import Boxes

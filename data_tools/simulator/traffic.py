@@ -21,15 +21,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from data_tools.simulator.fleet import (
+from data_tools.simulator.road import (
     HARDEST_BRAKING,
     HITCH,
+    LaneOrder,
+    Lanes,
     best_lane_changes,
     following_acceleration,
     free_acceleration,
     lane_change_gain,
+    smooth_step,
+    smooth_step_slope,
 )
-from data_tools.simulator.road import LaneOrder, Lanes, smooth_step, smooth_step_slope
 from data_tools.simulator.road_users import SimulatedTrajectories
 from data_tools.simulator.scene_layout import SceneLayout
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray

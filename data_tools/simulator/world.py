@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from data_tools.simulator.fleet import CAR
+from data_tools.simulator.road import CAR
 from data_tools.simulator.road_users import (
     SimulatedTrajectories,
     concatenated,
@@ -20,11 +20,14 @@ from data_tools.simulator.scene_layout import SceneLayout, sample_cones, sample_
 from data_tools.simulator.sensed_world import (
     SensedWorld,
     annotate,
+    detect,
     detect_lights,
+    outside_outages,
+    range_drifts,
     sample_map,
+    sensor_position,
     signals_of,
 )
-from data_tools.simulator.sensors import detect, outside_outages, range_drifts, sensor_position
 from data_tools.simulator.settings import SimulatorSettings
 from data_tools.simulator.traffic import Traffic, TrafficHistory, record_traffic, split_trailers
 from saga_fg.errors import InputError

@@ -15,7 +15,7 @@ from pipelines.report.page import Report, report_page, result_figures
 from pipelines.report.scenes import ReportScene
 from saga_fg.errors import InputError
 from saga_fg.tables.column_names import TableImport
-from saga_fg.tables.data_frames import Table
+from saga_fg.tables.detections import Table
 
 _HEIGHT = 720  # of the frame in a notebook, pixels
 

@@ -1,8 +1,17 @@
 """Many scenes in parallel: on the cores of this machine or on a Ray cluster, with a manifest of the results."""
 
 from pipelines.scale_out.pools import Job, LocalPool, Outcome, RayPool, SceneTask, new_pool, perform
-from pipelines.scale_out.results import Manifest, OutputFolder, Record, file_name
-from pipelines.scale_out.run import Pool, RunSummary, SmoothTask, TrackTask, run_scenes
+from pipelines.scale_out.run import (
+    Manifest,
+    OutputFolder,
+    Pool,
+    Record,
+    RunSummary,
+    SmoothTask,
+    TrackTask,
+    file_name,
+    run_scenes,
+)
 
 __all__ = [
     "Job",

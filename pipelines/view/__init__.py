@@ -4,8 +4,16 @@
 (https://foxglove.dev), or rerun's viewer, which opens
 """
 
-from pipelines.view.drawing import Drawing, in_order
-from pipelines.view.scenes import SceneView, SlamView, draw_scene, draw_slam, read_slam_view, result_views
+from pipelines.view.scenes import (
+    Drawing,
+    SceneView,
+    SlamView,
+    draw_scene,
+    draw_slam,
+    in_order,
+    read_slam_view,
+    result_views,
+)
 from pipelines.view.writers import check_view_file, load_rerun, show_rerun, write_view
 
 __all__ = [

@@ -1,4 +1,9 @@
-"""Results as drawings at times from a scene's start: boxes and tracks, paths and maps of SLAM.
+"""Results as drawings: shapes in frames at times, of boxes and tracks, paths and maps of SLAM.
+
+    scenes.py -> `Drawing`s in order of time -> writers.py
+
+Frames are a tree of names: `Drawing(frame="scene/ego", name="lidar", shape=Pose(...))` says where the frame
+`scene/ego/lidar` is in `scene/ego`. A drawing replaces the one before it of the same name.
 
 A scene and its tracks as drawings, at times from the scene's start (its first moment or scan).
 
@@ -32,9 +37,10 @@ Metres, about `origin`.
 from __future__ import annotations
 
 import colorsys
+import heapq
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -49,22 +55,106 @@ from data_tools.metrics import SceneBoxes
 from data_tools.trajectories import Trajectory, read_tum_poses
 from pipelines.report.page import result_scenes
 from pipelines.report.scenes import UNMEASURED, Edges, ReportScene, edges_of_frames, latest_detections
-from pipelines.view.drawing import (
-    VEHICLE,
-    Arrows,
-    Colour,
-    Drawing,
-    Facts,
-    Lines,
-    Points,
-    Pose,
-    Shape,
-    Solids,
-    in_order,
-    one_colour,
-)
 from saga_fg import Boxes, InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray, checked
+
+VEHICLE = (4.6, 1.9, 1.6)  # length, width, height of the box drawn for the vehicle, m
+Colour = tuple[int, int, int]
+"""Red, green, blue, 0 to 255. Shapes have one of them for all, (1, 3), or one each, (N, 3)."""
+Facts = Mapping[str, Sequence[str]]
+"""Columns of texts by name, a row for each thing; the first column holds their identifiers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solids:
+    """N boxes, or ellipsoids if `round`: centre and size (N, 3), m, yaw (N,), rad; facts of each, or none.
+
+    size: length, width, height
+    """
+
+    centre: FloatArray
+    size: FloatArray
+    yaw: FloatArray
+    colour: IntArray
+    facts: Facts = field(default_factory=dict)
+    round: bool = False
+
+    @property
+    def labels(self) -> list[str]:
+        """The facts of each solid in a line; empty without facts."""
+        return [" ".join(row) for row in zip(*self.facts.values(), strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """N strips of points (n, 3), m; radius (1,) or (N,), m."""
+
+    strips: Sequence[FloatArray]
+    colour: IntArray
+    radius: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Arrows:
+    """N arrows from their tail (N, 3), m, along a vector (N, 2) in the plane, m."""
+
+    tail: FloatArray
+    vector: FloatArray
+    colour: IntArray
+    radius: float
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """N points (N, 3), m, drawn with a radius, m; with their names, or a cloud without."""
+
+    points: FloatArray
+    colour: IntArray
+    radius: float
+    names: Sequence[str] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """The pose (4, 4) of a frame in its parent."""
+
+    parent_T_child: FloatArray
+
+
+Shape = Solids | Lines | Arrows | Points | Pose
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """A shape in a frame.
+
+    frame   frame of the shape's coordinates
+    name    of the layer, below that of the frame; of a pose: of the frame that it places
+    time    s from the start, None for a static shape
+    moment  row of the scene's moment, if it belongs to one
+    """
+
+    frame: str
+    name: str
+    shape: Shape
+    time: float | None = None
+    moment: int | None = None
+
+    @property
+    def path(self) -> str:
+        """The name with the names of all frames above it."""
+        return f"{self.frame}/{self.name}"
+
+
+def in_order(*drawings: Iterable[Drawing]) -> Iterator[Drawing]:
+    """Merge sequences of drawings, each in order of time; static ones come first."""
+    return heapq.merge(*drawings, key=lambda each: -np.inf if each.time is None else each.time)
+
+
+def one_colour(colour: Colour) -> IntArray:
+    """Return a colour for all shapes, (1, 3)."""
+    return np.array([colour], dtype=np.int64)
+
 
 HISTORY = 4.0  # s, of trajectories
 FLAT = 0.04  # m, height of an ellipse

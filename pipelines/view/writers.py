@@ -24,7 +24,7 @@ from typing import Any, assert_never
 import numpy as np
 
 from data_tools.files.atomic_files import atomic_file, check_writable
-from pipelines.view.drawing import Arrows, Drawing, Lines, Points, Pose, Shape, Solids
+from pipelines.view.scenes import Arrows, Drawing, Lines, Points, Pose, Shape, Solids
 from saga_fg.errors import InputError, MissingExtraError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import rotation_quaternion, yaw_quaternion

@@ -1,6 +1,6 @@
 """Estimators behind one base class, and the textbook reference they must agree with."""
 
-from saga_fg.estimators.batch import BatchSolver
+from saga_fg.estimators.batch import BatchSolver, GraphSolution
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.estimator import Estimator
 from saga_fg.estimators.graph_filter import GraphFilter
@@ -11,7 +11,6 @@ from saga_fg.estimators.measurements import Measurements, Observations
 from saga_fg.estimators.object_factors import DetectionFactors, Interactions, NewObjects
 from saga_fg.estimators.reference import Gaussian, kalman_predict, kalman_update, rts_smooth
 from saga_fg.estimators.smoother import RecordingSmoother, SmoothedState
-from saga_fg.estimators.solution import GraphSolution
 
 __all__ = [
     "BatchSolver",

@@ -27,7 +27,7 @@ from saga_fg.errors import InputError, UnknownNodeError, require_type
 from saga_fg.estimators.block_gaussian import BlockGaussian, not_smaller
 from saga_fg.estimators.estimator import Estimator
 from saga_fg.estimators.filtering import Dynamics, predict
-from saga_fg.estimators.graph_window import SAME_TIME, GraphState, GraphWindow, WindowEpoch
+from saga_fg.estimators.graph_window import SAME_TIME, GraphState, GraphWindow, WholeGraph, WindowEpoch, whole_graph
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.independent import IndependentObjects, IndependentVariables, uncoupled
 from saga_fg.estimators.interval_dynamics import (
@@ -42,7 +42,6 @@ from saga_fg.estimators.measurements import Measured, Measurements, Observations
 from saga_fg.estimators.object_factors import DetectionFactors, Interactions
 from saga_fg.estimators.partition import StateLayout, checked_prior
 from saga_fg.estimators.smoother import SmoothedState
-from saga_fg.estimators.whole_graph import WholeGraph, whole_graph
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import WIDE, SceneFactorGraph
 from saga_fg.graph.variables import MAP_NODE, OBJECT, node_key

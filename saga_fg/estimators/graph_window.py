@@ -1,4 +1,4 @@
-"""The window of a running graph: its epochs, with what came at each, so that what comes late goes in its place.
+"""The window of a running graph: its epochs with what came at each, and the graph of all objects over it.
 
 A measurement of the past takes the filter back to the epoch before it: the interval that contains its time is
 discretised anew over both parts, with the edges as they were recorded, and all that came since comes again. That is
@@ -7,7 +7,7 @@ exact wherever the filter is, and asks nothing of a solver but to begin from an 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,13 +15,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
+from saga_fg.estimators.batch import linear_solution
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.filtering import Dynamics
 from saga_fg.estimators.independent import IndependentObjects
-from saga_fg.estimators.partition import StateLayout
+from saga_fg.estimators.partition import Partition, StateLayout
+from saga_fg.estimators.smoother import SmoothedState
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.graph.variables import node_key
 from saga_fg.model.discretisation import Transition
-from saga_fg.numerics.arrays import BoolArray, checked
+from saga_fg.numerics.arrays import BoolArray, FloatArray, checked
 
 SAME_TIME = 1e-9  # s
 LEFT = "marginalise"  # the call by which nodes leave
@@ -131,3 +134,54 @@ class GraphState:
     predictions: int
     posterior: BlockGaussian | None
     before: tuple[BlockGaussian, Dynamics] | None = None  # see there; without nodes in iSAM2 not needed
+
+
+@dataclass(frozen=True, eq=False)
+class WholeGraph:
+    """The graph of all objects, and the epochs of its window, oldest first: time, s, and keys of variables by id."""
+
+    graph: SceneFactorGraph
+    keys: Sequence[tuple[float, Mapping[int, int]]]
+
+    def epochs(self, present: StateLayout, start: float) -> Iterator[tuple[float, StateLayout, list[int], FloatArray]]:
+        """Time, layout, keys and mean of every epoch from `start`, s, on, of the `present` nodes that it has."""
+        variables = self.graph.variables
+        for time, keys in self.keys:
+            if time >= start - SAME_TIME:
+                there = np.array([keys.get(node) in variables for node in present.nodes.tolist()], dtype=bool)
+                layout = present.select(there)
+                here = [keys[node] for node in layout.nodes.tolist()]
+                yield time, layout, here, np.concatenate([np.empty(0), *(self.graph.state(key) for key in here)])
+
+    def smoothed(self, present: StateLayout, start: float) -> tuple[SmoothedState, ...]:
+        """The states of these epochs given all measurements."""
+        solution, result = linear_solution(self.graph), list[SmoothedState]()
+        for time, layout, here, mean in self.epochs(present, start):
+            joint = Partition(layout, np.zeros(len(layout), dtype=np.int64))
+            blocks = (solution.covariance(here)[None],) if here else ()
+            result.append(SmoothedState(time, BlockGaussian(joint, mean, blocks)))
+        return tuple(result)
+
+
+def whole_graph(
+    graph: SceneFactorGraph, independent: IndependentObjects, window: GraphWindow, labels: Mapping[int, str]
+) -> WholeGraph:
+    """Add the independent objects to a graph of the others; labels: classes by id."""
+    nodes = independent.layout.nodes
+    keys: dict[int, Mapping[int, int]] = {epoch.number: epoch.keys for epoch in window.epochs}
+    if len(nodes):
+        graph = graph.copy()
+        old = {
+            node_key(node, epoch.number)
+            for node in nodes.tolist()
+            for epoch in independent.epochs[independent.since(node) :]
+        }
+        graph.marginalise(old & graph.variables.keys())  # of nodes of the same ids that have left
+        added = independent.add_to(graph, nodes, labels)
+        step, base, values = linear_solution(graph).step, graph.base, graph.values
+        for key in {key for own in added for key in own.values()}:  # the others are where iSAM2 has them
+            values.update(key, base.atVector(key) + step.at(key))
+        graph.moved_to(values)
+        for epoch, own in zip(independent.epochs, added, strict=True):
+            keys[epoch.number] = {**keys.get(epoch.number, {}), **own}
+    return WholeGraph(graph, [(epoch.time, keys[epoch.number]) for epoch in window.epochs])

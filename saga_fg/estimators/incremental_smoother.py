@@ -5,8 +5,8 @@ linearises itself: no callback runs in an update, and a factor that raises does 
 more than `threshold` of its own standard deviations from where its factors were linearised, these are linearised
 anew, families in NumPy all at once, and exchanged: the old ones out, the new ones in (Kaess et al., "iSAM2", IJRR 31,
 2012). Robust losses are weighted anew with it (iteratively reweighted least squares). Where that does not
-settle, as after a poor start, damped steps solve the graph (`saga_fg.estimators.damped_steps`), and iSAM2 begins anew
-from there.
+settle, as after a poor start, damped steps solve the graph (`saga_fg.estimators.relinearisation`), and iSAM2 begins
+anew from there.
 
 Epochs older than `lag` are marginalised: their factors go out, the prior that they leave on their neighbours comes in,
 and iSAM2 drops the variables without factors. Between the two they need not be leaves of the Bayes tree, which
@@ -23,11 +23,11 @@ import numpy as np
 
 from factors.gaussian import Elimination
 from saga_fg.errors import InputError, require_type
+from saga_fg.estimators.batch import GraphSolution
 from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.interval_dynamics import joint_gaussian
 from saga_fg.estimators.isam2_engine import Engine, RelinearisationSettings
 from saga_fg.estimators.partition import StateLayout
-from saga_fg.estimators.solution import GraphSolution
 from saga_fg.graph.providers import FactorProvider, GraphView, OtherVariables, ask, predictors
 from saga_fg.graph.scene_factor_graph import Condensation, SceneFactorGraph
 from saga_fg.graph.variables import GraphError, LinearisationPoint

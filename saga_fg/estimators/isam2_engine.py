@@ -26,8 +26,7 @@ import scipy.linalg
 
 from factors import FactorError, SingularSystemError, marginal_moments
 from factors.gaussian import Elimination, block_covariances, native_factor, singular_system
-from saga_fg.estimators.damped_steps import solve_damped
-from saga_fg.estimators.displacements import Displacements
+from saga_fg.estimators.relinearisation import Displacements, solve_damped
 from saga_fg.graph.factor_checks import solver_error
 from saga_fg.graph.factor_groups import HeldGroup
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph

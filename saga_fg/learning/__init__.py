@@ -1,6 +1,5 @@
 """Learn from recordings: noise, scores and detection probability of sensors, process noise, and interactions."""
 
-from saga_fg.learning.class_confusion import learn_confusion, learn_sizes
 from saga_fg.learning.hidden_objects import GapPrediction, HiddenObjects, hidden_objects
 from saga_fg.learning.interaction_fit import (
     MAX_GAPS,
@@ -27,7 +26,13 @@ from saga_fg.learning.process_noise import (
     fit_curvilinear,
     fit_curvilinear_by_class,
 )
-from saga_fg.learning.sensor_fit import fit_position_noise, fit_score_calibration, fit_sensor
+from saga_fg.learning.sensor_fit import (
+    fit_position_noise,
+    fit_score_calibration,
+    fit_sensor,
+    learn_confusion,
+    learn_sizes,
+)
 from saga_fg.learning.trajectory_noise import DetectedTrajectory, fit_trajectory_noise, sample_with_tracker
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Edge rules: which nodes interact, through which function, at what rate.
+"""Edge rules: who acts on whom, at which rate; rigid bonds of trailers and riders.
 
 rate_ij = r_j * rate * exp( -d_ij^2 / (2 distance_scale^2) ) * exp( -dheading_ij^2 / (2 heading_scale^2) ) * ...
               r_j * rate * exp( -ahead_ij / gap_scale ) * ...                                  behind a leader
@@ -25,6 +25,13 @@ is that of the nearest cone, and the vehicle has to pass on the other one: with 
 the distance c that drivers keep between cones and the middle of their vehicle,
 
     demand(a) = m y(a) + c         how far to the side the vehicle has to be by a; above 0: it is pushed
+
+Rigid bonds, of a trailer and its truck, of a bicycle and its rider:
+
+    dv_i/dt += rate ( v_j - v_i + ( p_j - p_i - d_ij ) / tau ),    d_ij the offset at the start of the interval
+
+Edges go both ways: each takes on the other's velocity and keeps its place relative to it, so that detections of one
+correct the other as well. From one interval to the next the offset may turn with the pair.
 """
 
 from __future__ import annotations
@@ -39,13 +46,18 @@ import numpy as np
 from saga_fg.kernels.edges import leader_rates, neighbour_rates, pairs_ahead
 from saga_fg.model.interactions import (
     NO_PATHS,
+    POSITION,
     SHARP,
+    VELOCITY,
     CarFollowing,
     Interaction,
+    Needs,
     NodeTable,
     SharedVelocity,
+    Triples,
     ahead_and_aside,
     unit,
+    velocity_triples,
 )
 from saga_fg.model.nonlinear_interactions import (
     AccelerationLaw,
@@ -55,7 +67,7 @@ from saga_fg.model.nonlinear_interactions import (
     nearest_offset,
 )
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
-from saga_fg.numerics.gating import near_pairs
+from saga_fg.numerics.geometry import near_pairs, wrap_angle
 from saga_fg.parts import part_kind
 from saga_fg.settings import (
     NonNegative,
@@ -414,3 +426,60 @@ def _columns(nodes: NodeTable, information: bool) -> tuple[FloatArray, FloatArra
     if not information:
         return exists, moved, np.ones(len(nodes)), -1.0
     return exists, moved, nodes.velocity_variance + (UNSEEN_ACCELERATION * nodes.unseen) ** 2, SPREAD
+
+
+OFFSET_TIME = 1.0  # tau: time constant with which a change of the offset is undone, s
+SPEED_SCALE = 2.0  # m/s, sigma of the kernel on the difference of velocities
+
+
+@dataclass(frozen=True)
+class RigidCoupling:
+    """A node keeps the velocity of another and its present place relative to it."""
+
+    needs: ClassVar[Needs] = (POSITION + VELOCITY, POSITION + VELOCITY)
+
+    def triples(self, nodes: NodeTable, target: IntArray, source: IntArray) -> Triples:
+        offset = nodes.position[source] - nodes.position[target]
+        stiffness = np.eye(2) / OFFSET_TIME
+        return velocity_triples(
+            nodes, target, source, -stiffness, -np.eye(2), stiffness, np.eye(2), -offset / OFFSET_TIME
+        )
+
+
+@dataclass(frozen=True)
+class Attached(Settings):
+    """Every object of some classes is attached to the nearest of some others that touches it and moves as it does."""
+
+    map_classes: ClassVar[tuple[str, ...]] = ()
+    interaction: ClassVar[RigidCoupling] = RigidCoupling()
+    rate: ClassVar[float] = 3.0  # 1/s, usual 1 to 5
+    heading_scale: ClassVar[float] = 0.5  # rad, sigma of the kernel on the difference of headings
+    attached: tuple[str, ...] = setting(("trailer",), "classes of attached objects; more: more pairs are sought")
+    carriers: tuple[str, ...] = setting(("truck",), "classes of the objects they are attached to; likewise")
+    max_gap: NonNegative = setting(
+        2.0,
+        "largest distance between centres beyond half of both lengths, m; usual 1 to 3; higher: looser "
+        "pairs are coupled, too",
+    )
+
+    def pairs(self, nodes: NodeTable) -> Pairs:
+        parts, carriers = (np.flatnonzero(of_classes(nodes.label, names)) for names in (self.attached, self.carriers))
+        if len(parts) == 0 or len(carriers) == 0:
+            return Pairs(parts[:0], carriers[:0], np.empty(0))
+        apart = _distance(nodes.position, parts, carriers) - (nodes.length[parts, None] + nodes.length[carriers]) / 2
+        turn = wrap_angle(nodes.heading[parts, None] - nodes.heading[carriers])
+        difference = _distance(nodes.velocity, parts, carriers)
+        exponent = (turn / self.heading_scale) ** 2 + (difference / SPEED_SCALE) ** 2
+        rate = np.where(apart <= self.max_gap, self.rate * np.exp(-exponent / 2), 0.0)
+        of_part, of_carrier = rate.argmax(axis=1), rate.argmax(axis=0)
+        rows = np.arange(len(parts))
+        mutual = (of_carrier[of_part] == rows) & (rate[rows, of_part] > 0)
+        a, b = parts[mutual], carriers[of_part[mutual]]
+        r = rate[rows, of_part][mutual]
+        return Pairs(np.concatenate([a, b]), np.concatenate([b, a]), np.concatenate([r, r]))
+
+
+def _distance(values: FloatArray, rows: IntArray, others: IntArray) -> FloatArray:
+    """(k, m) lengths of the differences of values (n, 2)."""
+    difference = values[rows, None] - values[others]
+    return np.hypot(difference[..., 0], difference[..., 1])

@@ -31,11 +31,10 @@ import scipy.linalg
 
 from saga_fg.errors import InputError
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours
+from saga_fg.model.edge_rules import Attached, EdgeRule, Following, Neighbours
 from saga_fg.model.interactions import NodeTable, applies, unit
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
-from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import Range, Settings, setting, settings_group

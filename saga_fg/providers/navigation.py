@@ -35,7 +35,7 @@ from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.graph.variables import EGO_BIAS, EGO_CALIBRATION, EGO_POSE, EGO_VELOCITY, NewVariable
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.gating import chi_square_quantile
+from saga_fg.numerics.geometry import chi_square_quantile
 from saga_fg.providers.odometry import ANTENNA, INERTIAL, NO_POSE, ON_THE_POSE, Mounting, StartSettings, mounting
 from saga_fg.settings import Fraction, Positive, PositiveOrInf, Settings, setting, settings_group
 from saga_fg.types.frame import ImuSamples

@@ -47,7 +47,7 @@ import numpy as np
 from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import gate, least_total, mahalanobis_of_pairs
-from saga_fg.numerics.gating import near_pairs
+from saga_fg.numerics.geometry import near_pairs
 from saga_fg.smoothing.states import Lifespans, StateTable, lifespans_of
 from saga_fg.tracking.class_belief import ConfusedClasses
 from saga_fg.tracking.measurements import frame_measurements

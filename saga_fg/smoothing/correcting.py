@@ -15,7 +15,7 @@ import numpy as np
 from saga_fg.graph import FactorProvider
 from saga_fg.model.sensor import FieldOfView, Sensor
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.numerics.gating import near_pairs
+from saga_fg.numerics.geometry import near_pairs
 from saga_fg.smoothing.association import Evidence, EvidenceFrame, assign_free_detections, evidence_scores
 from saga_fg.smoothing.batch_states import StationaryStates, stationary_states
 from saga_fg.smoothing.corrections import Correction, Place, WholeObject

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
-from saga_fg.numerics.gating import near_pairs
+from saga_fg.numerics.geometry import near_pairs
 from saga_fg.smoothing.association import Evidence
 from saga_fg.smoothing.states import Lifespans, Probabilities, StateTable
 from saga_fg.types.shown import data_frame, text_table

@@ -16,7 +16,7 @@ from saga_fg.smoothing.recording_labels import RecordingLabels
 from saga_fg.smoothing.settings import SmoothingSettings
 from saga_fg.smoothing.states import Labels
 from saga_fg.tables.column_names import TableImport
-from saga_fg.tables.data_frames import Table, raw_table, scenes_of, table_like
+from saga_fg.tables.detections import Table, raw_table, scenes_of, table_like
 from saga_fg.tracking import Tracker, TrackerSettings
 from saga_fg.tracking.table_tracking import UNKNOWN_SENSORS, check_scenes
 

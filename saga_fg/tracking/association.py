@@ -53,7 +53,7 @@ from saga_fg.numerics.assignment import (
     least_total,
     pair_costs,
 )
-from saga_fg.numerics.gating import near_pairs
+from saga_fg.numerics.geometry import near_pairs
 from saga_fg.parts import of_own_code
 from saga_fg.tracking.class_belief import NONE_CONFUSED, ConfusedClasses
 from saga_fg.tracking.given_identities import identity_cost

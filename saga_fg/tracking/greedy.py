@@ -15,7 +15,7 @@ import numpy as np
 from saga_fg.errors import require_type
 from saga_fg.model.sensor import Sensor, checked_sensors, sensor_model
 from saga_fg.numerics.arrays import Columns, FloatArray, IntArray, StrArray
-from saga_fg.numerics.gating import near_pairs
+from saga_fg.numerics.geometry import near_pairs
 from saga_fg.settings import PositiveOrInf, Settings, setting, settings_group
 from saga_fg.tracking.clock import MAX_JUMP, Clock, TimeVerdict
 from saga_fg.tracking.clock_offsets import SensorTime, SharedObservations, sensor_times

@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.graph import EGO_ERROR, MAP_NODE, OBJECT, GraphVariable, SceneFactorGraph
-from saga_fg.model.edge_effects import EdgeEffect, edge_effects
+from saga_fg.model.graph_building import EdgeEffect, edge_effects
 from saga_fg.model.interactions import NodeTable
 from saga_fg.model.scene_graph import SceneGraph
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray

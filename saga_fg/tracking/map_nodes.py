@@ -42,9 +42,9 @@ import numpy as np
 
 from saga_fg.model.edge_rules import EdgeRule
 from saga_fg.model.interactions import NodeTable
+from saga_fg.model.map_rules import GreenLight, RedLight, coming_vehicles, halting
 from saga_fg.model.motion import Motion, RandomWalk
 from saga_fg.model.sensor import Sensor
-from saga_fg.model.stop_lines import GreenLight, RedLight, coming_vehicles, halting
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray, of_classes
 from saga_fg.numerics.assignment import assign, gate, mahalanobis
 from saga_fg.tracking.joint_state import JointTrackState

@@ -40,8 +40,7 @@ from saga_fg.numerics.arrays import (
     of_classes,
     unchecked,
 )
-from saga_fg.numerics.gating import near_pairs
-from saga_fg.numerics.geometry import yaw_of
+from saga_fg.numerics.geometry import near_pairs, yaw_of
 from saga_fg.tracking.class_belief import NONE_CONFUSED, ConfusedClasses
 from saga_fg.tracking.joint_state import JointTrackState
 from saga_fg.tracking.settings import ClassSettings, EgoNodeSettings, TrackerSettings

@@ -9,8 +9,8 @@ from typing import Annotated, Literal, NamedTuple, Protocol
 
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours, Repulsion, traffic_rules
-from saga_fg.model.lanes import ConeLine, InLane
+from saga_fg.model.edge_rules import Attached, EdgeRule, Following, Neighbours, Repulsion, traffic_rules
+from saga_fg.model.map_rules import ConeLine, GreenLight, InLane, RedLight
 from saga_fg.model.modes import Mixture
 from saga_fg.model.motion import (
     ConstantAcceleration,
@@ -21,9 +21,7 @@ from saga_fg.model.motion import (
     RandomWalk,
 )
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
-from saga_fg.model.rigid_coupling import Attached
 from saga_fg.model.stability import require_stable
-from saga_fg.model.stop_lines import GreenLight, RedLight
 from saga_fg.model.turning import CoordinatedTurn
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.parts import part_kind

@@ -11,7 +11,7 @@ from saga_fg.model.edge_rules import acting_classes
 from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.tables.column_names import TableImport
 from saga_fg.tables.columns import RawTable
-from saga_fg.tables.data_frames import Table, raw_table, scenes_of, table_like, tell
+from saga_fg.tables.detections import Table, raw_table, scenes_of, table_like, tell
 from saga_fg.tables.plausibility import idle_rules
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker import Tracker

@@ -37,7 +37,7 @@ from saga_fg.model.discretisation import own_motion
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.numerics.assignment import Matching
-from saga_fg.numerics.gating import chi_square_quantile
+from saga_fg.numerics.geometry import chi_square_quantile
 from saga_fg.tracking.joint_state import moved_to_present
 from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
 from saga_fg.tracking.track_filters import MOVING, Kinematics

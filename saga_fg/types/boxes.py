@@ -33,8 +33,7 @@ from numpy.typing import ArrayLike
 from saga_fg.errors import InputError
 from saga_fg.kernels.pairs import paired_overlaps
 from saga_fg.numerics.arrays import Columns, FloatArray, IntArray, StrArray, checked, checked_labels
-from saga_fg.numerics.gating import near_pairs
-from saga_fg.numerics.geometry import transform_points, wrap_angle
+from saga_fg.numerics.geometry import near_pairs, transform_points, wrap_angle
 
 MAX_POSITION = 1e9  # m; beyond, distances have no digits left
 MAX_SPEED = 1e6  # m/s

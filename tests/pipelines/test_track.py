@@ -21,7 +21,7 @@ from pipelines.config import Family, TrackConfig, load_config
 from pipelines.configuration import read_settings, write_settings
 from pipelines.configuration.reading import settings_of
 from saga_fg import Curvilinear, InputError, Tracker, TrackerSettings
-from saga_fg.model.lanes import InLane
+from saga_fg.model.map_rules import InLane
 from saga_fg.providers import Gps, Landmarks, Odometry, StartSettings
 from saga_fg.tracking import ClassSettings
 from saga_fg.tracking.traffic import TrafficSettings

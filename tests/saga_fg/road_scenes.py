@@ -8,12 +8,10 @@ from saga_fg import ConstantVelocity, NodeType, RandomWalk
 from saga_fg.conformance.programs import Add, Marginalise, Predict, Update
 from saga_fg.estimators import Measurements
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.edge_rules import Following
+from saga_fg.model.edge_rules import Attached, Following
 from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import NodeTable
-from saga_fg.model.lanes import ConeLine, InLane
-from saga_fg.model.rigid_coupling import Attached
-from saga_fg.model.stop_lines import GreenLight, RedLight
+from saga_fg.model.map_rules import ConeLine, GreenLight, InLane, RedLight
 
 CAR = NodeType("vehicle", ConstantVelocity(acceleration_noise=0.5))
 STANDING = NodeType("standing", RandomWalk())

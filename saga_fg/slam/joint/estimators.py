@@ -20,9 +20,9 @@ import numpy as np
 
 from factors import SolverSettings
 from saga_fg.errors import InputError
+from saga_fg.estimators.batch import GraphSolution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
-from saga_fg.estimators.solution import GraphSolution
 from saga_fg.graph import FactorProvider, GraphError, SceneFactorGraph, ask_all
 from saga_fg.numerics.arrays import FloatArray, checked_covariances
 from saga_fg.numerics.geometry import checked_transform, yaw_transform

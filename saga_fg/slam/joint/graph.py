@@ -39,7 +39,7 @@ from factors import (
     relative_factors,
 )
 from saga_fg.errors import InputError
-from saga_fg.estimators.solution import GraphSolution
+from saga_fg.estimators.batch import GraphSolution
 from saga_fg.graph import EGO_ERROR, EGO_POSE, OBJECT, Additions, GraphView, NewVariable, key_of
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.providers import Factors

@@ -17,7 +17,7 @@ from factors import (
     pose,
     pose_prior_factor,
 )
-from saga_fg.estimators.solution import GraphSolution
+from saga_fg.estimators.batch import GraphSolution
 from saga_fg.graph import EGO_POSE, LANDMARK, Additions, GraphView, NewVariable, key_of
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.numerics.arrays import FloatArray

@@ -32,10 +32,9 @@ import numpy as np
 
 from factors import Robust, SolverSettings
 from saga_fg.errors import InputError
-from saga_fg.estimators.batch import BatchSolver
+from saga_fg.estimators.batch import BatchSolver, GraphSolution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
-from saga_fg.estimators.solution import GraphSolution
 from saga_fg.graph import Additions, FactorProvider, GraphView, SceneFactorGraph, ask_all
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import inverse_transform

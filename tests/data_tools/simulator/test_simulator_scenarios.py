@@ -9,16 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from data_tools.simulator import SimulatorSettings
-from data_tools.simulator.fleet import (
+from data_tools.simulator.road import (
     CAR,
     KINDS,
     Drivers,
     Fleet,
+    Lanes,
+    curved_road,
     equilibrium_gap,
     following_acceleration,
     free_acceleration,
 )
-from data_tools.simulator.road import Lanes, curved_road
 from data_tools.simulator.scene_layout import ClosingLine, SceneLayout, SlowZone, sample_intervals
 from data_tools.simulator.settings import ScenarioName, scenario_settings
 from data_tools.simulator.traffic import Traffic, record_traffic

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from data_tools.simulator.road import LaneOrder, Lanes, Road, curved_road, smooth_step, smooth_step_slope
-from data_tools.simulator.sensors import (
+from data_tools.simulator.sensed_world import (
     detect,
     detection_probability,
     in_view,

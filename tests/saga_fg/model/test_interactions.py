@@ -18,6 +18,7 @@ from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import Following
 from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity, applies
+from saga_fg.model.map_rules import DriverStopping, RedLight
 from saga_fg.model.nonlinear_interactions import (
     HIDDEN_VEHICLE_GAP,
     MAX_DECELERATION,
@@ -28,7 +29,6 @@ from saga_fg.model.nonlinear_interactions import (
     smooth_acceleration,
 )
 from saga_fg.model.stability import require_stable
-from saga_fg.model.stop_lines import DriverStopping, RedLight
 from saga_fg.numerics.geometry import yaw_transform
 from tests.saga_fg.road_scenes import queue, table
 

@@ -9,12 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import InputError
-from saga_fg.model.edge_rules import CLEARANCE, Following, anticipated
+from saga_fg.model.edge_rules import CLEARANCE, OFFSET_TIME, Attached, Following, RigidCoupling, anticipated
 from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import SharedVelocity
-from saga_fg.model.lanes import CONE_RATE, PREVIEW, ConeLine, InLane
-from saga_fg.model.rigid_coupling import OFFSET_TIME, Attached, RigidCoupling
-from saga_fg.model.stop_lines import GreenLight, RedLight, Stopping
+from saga_fg.model.map_rules import CONE_RATE, PREVIEW, ConeLine, GreenLight, InLane, RedLight, Stopping
 from saga_fg.numerics.geometry import direction_at, feet
 from saga_fg.types.road_map import (
     STATES,

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.stats import multivariate_normal
 
 from saga_fg.numerics import assignment
-from saga_fg.numerics import gating as module
+from saga_fg.numerics import geometry as module
 from saga_fg.numerics.assignment import (
     CrossCovariances,
     PairCosts,
@@ -22,7 +22,7 @@ from saga_fg.numerics.assignment import (
     pair_costs,
     tree_edges,
 )
-from saga_fg.numerics.gating import near_pairs
+from saga_fg.numerics.geometry import near_pairs
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -10,7 +10,7 @@ import pytest
 
 import saga_fg
 from saga_fg import Detection, Detections, Frame, InputError, MissingExtraError, Tracker, Tracks
-from saga_fg.tables.data_frames import frames_of
+from saga_fg.tables.detections import frames_of
 
 pd = pytest.importorskip("pandas", reason="pandas comes with the extra pandas")
 

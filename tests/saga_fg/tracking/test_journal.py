@@ -13,8 +13,8 @@ from saga_fg import Detection, Detections, Frame, Sensor, Tracker, TrackerSettin
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import OBJECT, Additions
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.edge_effects import edge_effects
 from saga_fg.model.edge_rules import Following, Neighbours
+from saga_fg.model.graph_building import edge_effects
 from saga_fg.model.interactions import NodeTable, SharedVelocity
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph

@@ -15,8 +15,8 @@ from saga_fg.estimators.reference import Gaussian, kalman_predict
 from saga_fg.graph import OBJECT, Additions, GraphError, GraphView
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import SharedVelocity
+from saga_fg.model.map_rules import RedLight
 from saga_fg.model.sensor import NoiseModel, Sensor
-from saga_fg.model.stop_lines import RedLight
 from saga_fg.tracking import AssociationSettings, ClassSettings
 from saga_fg.tracking.map_nodes import Element, elements, in_known_names
 from saga_fg.types.boxes import MAX_POSITION

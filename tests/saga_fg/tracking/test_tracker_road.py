@@ -11,13 +11,11 @@ from hypothesis import strategies as st
 
 from saga_fg import Detection, Detections, Frame, Sensor, Tracker, TrackerSettings
 from saga_fg.errors import InputError
-from saga_fg.model.edge_rules import Following, Pairs
+from saga_fg.model.edge_rules import Attached, Following, Pairs
 from saga_fg.model.interactions import SharedVelocity
-from saga_fg.model.lanes import ConeLine, InLane
+from saga_fg.model.map_rules import ConeLine, GreenLight, InLane, RedLight
 from saga_fg.model.motion import ConstantVelocity, RandomWalk
 from saga_fg.model.nonlinear_interactions import SmoothDriver
-from saga_fg.model.rigid_coupling import Attached
-from saga_fg.model.stop_lines import GreenLight, RedLight
 from saga_fg.tracking import ClassSettings
 from saga_fg.tracking.prediction import node_table
 from saga_fg.tracking.traffic import SPREAD, Passages, SpeedPriorSettings, Traffic, TrafficSettings, speed_prior

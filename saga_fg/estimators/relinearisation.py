@@ -1,4 +1,4 @@
-"""Damped steps for what plain relinearisation does not settle, component by component, and what has not settled then.
+"""Relinearisation: how far variables have moved, damped steps where plain ones do not settle, and what has not then.
 
 Gauss-Newton overshoots where residuals are large and curved, and can go to and fro between two points for ever. Each
 component of the graph with a nonlinear factor is then solved by itself: by Gauss-Newton with a line search, and by
@@ -13,7 +13,7 @@ in standard deviations of its marginal covariance P_kk. The others of its compon
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Iterable, KeysView, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -24,7 +24,7 @@ from saga_fg.graph.factor_checks import solver_error
 from saga_fg.graph.factor_groups import ActiveRows, HeldGroup
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import insert_state
-from saga_fg.numerics.arrays import IntArray
+from saga_fg.numerics.arrays import FloatArray, IntArray
 
 _MAX_STEPS = 60
 _LEAST_TOLERANCE = 1e-4  # sigma; Levenberg-Marquardt's last steps are shorter than rounding lets them be below
@@ -99,3 +99,64 @@ def _damped(
             return solution
         start = solution.values
     return solve(native, ours, start, SolverSettings(tolerance=max(threshold / 10, _LEAST_TOLERANCE)))
+
+
+class Displacements:
+    """Variables with delta_0 (d,), where their factors were linearised, and R (d, d), in rows without gaps.
+
+    Rows are as wide as the largest variable; what a smaller one does not fill is zero.
+    """
+
+    def __init__(self) -> None:
+        self._keys: list[int] = []
+        self._row: dict[int, int] = {}
+        self._dims: dict[int, int] = {}
+        self._at, self._root = np.zeros((16, 0)), np.zeros((16, 0, 0))
+
+    def add(self, dims: Mapping[int, int]) -> None:
+        """New variables at their base."""
+        first, (rows, width) = len(self._keys), self._at.shape
+        more = 2 * len(dims) + rows if first + len(dims) > rows else 0
+        wider = max([width, *dims.values()]) - width
+        if more or wider:
+            self._at = np.pad(self._at, ((0, more), (0, wider)))
+            self._root = np.pad(self._root, ((0, more), (0, wider), (0, wider)))
+        self._keys += dims
+        self._row |= dict(zip(dims, range(first, len(self._keys)), strict=True))
+        self._dims |= dims
+
+    def remove(self, keys: Iterable[int]) -> None:
+        """Forget variables; the last one takes the row of each."""
+        for key in keys:
+            row, last = self._row.pop(key), self._keys.pop()
+            del self._dims[key]
+            end = len(self._keys)
+            if last != key:
+                self._keys[row], self._row[last] = last, row
+                self._at[row], self._root[row] = self._at[end], self._root[end]
+            self._at[end], self._root[end] = 0.0, 0.0
+
+    def dims(self, keys: Iterable[int]) -> dict[int, int]:
+        """Dimensions of variables, by key in their order."""
+        return {key: self._dims[key] for key in keys}
+
+    @property
+    def keys(self) -> KeysView[int]:
+        """All variables."""
+        return self._dims.keys()
+
+    def set_root(self, key: int, R: FloatArray) -> None:
+        """Set R of a variable."""
+        self._root[self._row[key], : len(R), : len(R)] = R
+
+    def moved(self, delta: gtsam.VectorValues, threshold: float) -> list[int]:
+        """Variables that are farther off than the threshold; their linearisation point is reset."""
+        if not self._keys:
+            return []
+        n, now = len(self._keys), np.zeros_like(self._at[: len(self._keys)])
+        dims = np.array([self._dims[key] for key in self._keys])
+        now[np.arange(now.shape[1]) < dims[:, None]] = delta.vector(self._keys)
+        way = (self._root[:n] @ (now - self._at[:n])[:, :, None])[:, :, 0]
+        rows = np.flatnonzero(np.linalg.norm(way, axis=1) > threshold)
+        self._at[rows] = now[rows]
+        return [self._keys[row] for row in rows.tolist()]
