@@ -28,8 +28,7 @@ import numpy as np
 from data_tools.datasets.results import SceneResult
 from data_tools.metrics import SceneBoxes
 from saga_fg.numerics.arrays import BoolArray, IntArray
-from saga_fg.numerics.gating import near_pairs
-from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.numerics.geometry import near_pairs, wrap_angle
 from saga_fg.types.boxes import Boxes
 
 SAME = 0.02  # m and rad; Datumaro writes two decimals
