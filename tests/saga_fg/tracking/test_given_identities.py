@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-
 import numpy as np
 import pytest
 
@@ -61,13 +59,6 @@ def test_a_number_that_jumps_to_a_distant_object_does_not_take_the_track_along()
 
     found = owners([frame(0.1 * k, k >= 10) for k in range(20)])
     assert found[-1] == found[0]
-
-
-def test_a_tracker_that_goes_on_from_its_pickle_knows_the_numbers() -> None:
-    frames, tracker = meeting(), Tracker(WALKERS)
-    begun = owners(frames[:12], tracker)
-    assert owners(frames[12:], pickle.loads(pickle.dumps(tracker))) == owners(frames[12:], tracker)
-    assert begun[0] == owners(frames)[-1]
 
 
 def test_numbers_of_dead_tracks_are_forgotten() -> None:

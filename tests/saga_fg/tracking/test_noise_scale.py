@@ -84,19 +84,6 @@ def test_noise_that_comes_with_the_detections_stays_as_it_is():
         np.testing.assert_array_equal(a.position_covariance, b.position_covariance)
 
 
-def test_a_restored_tracker_goes_on_with_what_it_knows():
-    recording = [frame for frame, _ in frames(0.8, 40)]
-    tracker = Tracker(TrackerSettings(), TABLE)
-    for frame in recording[:20]:
-        tracker.step(frame)
-    other = Tracker(TrackerSettings(), TABLE)
-    other.restore(tracker.snapshot())
-    for frame in recording[20:]:
-        a, b = tracker.step(frame), other.step(frame)
-        np.testing.assert_array_equal(a.position_covariance, b.position_covariance)
-    assert other.noise_scales == tracker.noise_scales
-
-
 def test_models_are_scaled_in_positions_alone():
     scaled = scaled_sensors({}, {"table": 2.0})["table"].noise["default"]
     usual = Sensor().noise["default"]

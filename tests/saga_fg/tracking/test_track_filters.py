@@ -27,7 +27,6 @@ from saga_fg.tracking.track_filters import (
 from tests.saga_fg.traffic_frames import (
     assert_estimators_agree,
     at_pose,
-    columns,
     frame,
     run,
     seen,
@@ -287,17 +286,6 @@ def test_frames_seen_late_count_like_others():
     frames = seen(rng, straight((5.0, 0.0), (0.0, 0.0)), TIMES[:30])
     late = [frames[k] for k in (*range(20), 21, 20, *range(22, 30))]
     assert probabilities(late)[-1] == pytest.approx(probabilities(frames)[-1], abs=0.02)
-
-
-def test_snapshots_and_looking_ahead_keep_the_belief():
-    rng = np.random.default_rng(3)
-    frames = seen(rng, straight([(5.0, 0.0), (5.0, 20.0)], [(0.0, 0.0), (5.0, 0.0)]), TIMES)
-    tracker, other = Tracker(SETTINGS), Tracker(SETTINGS)
-    run(tracker, frames[:30])
-    other.restore(tracker.snapshot())
-    tracker.tracks(10.0)
-    for f in frames[30:]:
-        assert columns(tracker.step(f)) == columns(other.step(f))
 
 
 # Turn rates from headings, and what they do to tracks that nobody detects

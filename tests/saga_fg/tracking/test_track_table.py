@@ -65,8 +65,6 @@ def test_snapshots_share_no_array_that_can_be_written_and_empty_tables_take_trac
 
 # Several sensors' words about one track: what they add up to, and when they count as a confirmation
 
-NONE = np.empty(0, dtype=np.int64)
-
 
 def logit(p):
     return np.log(p / (1 - p))
@@ -417,13 +415,3 @@ def test_a_track_is_reported_from_its_nth_hit_on(estimator):
     frames = [crowd_frame(0.1 * k, [(0.0, 0.0)], 0.8) for k in range(4)]
     tracker = Tracker(unresolved_settings(min_hits=3, tentative_score_factor=0.0, estimator=estimator))
     assert [len(tracks) for tracks in run(tracker, frames)] == [0, 0, 1, 1]
-
-
-def test_a_copy_keeps_what_is_unresolved():
-    tracker = Tracker(unresolved_settings())
-    tracker.step(crowd_frame(0.0, [(0.0, 0.0), (0.7, 0.0)], [0.8, 0.6]))
-    other = Tracker(unresolved_settings())
-    other.restore(tracker.snapshot())
-    for k in (1, 2):
-        frame = crowd_frame(0.1 * k, [(0.0, 0.0), (0.7, 0.0)], [0.8, 0.6])
-        assert tracker.step(frame).score.tolist() == other.step(frame).score.tolist()

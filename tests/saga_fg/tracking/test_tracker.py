@@ -305,16 +305,6 @@ def test_the_same_frames_in_any_order_of_detections_give_the_same_tracks():
     assert_same(run(Tracker(), frames), run(Tracker(), reversed_later), tolerance=1e-9)
 
 
-def test_earlier_reports_do_not_change_afterwards():
-    tracker = Tracker()
-    frames = traffic()
-    history, copies = [], []
-    for f in frames:
-        history.append(tracker.step(f))
-        copies.append(columns(history[-1]))
-    assert [columns(t) for t in history] == copies
-
-
 def test_the_tracker_tells_which_detection_went_where():
     def told(timestamp, *rows):
         detections = [Detection("car", (*place, 0.0), score=score) for place, score in rows]

@@ -9,7 +9,6 @@ from saga_fg import (
     ConstantAcceleration,
     ConstantVelocity,
     Curvilinear,
-    Detections,
     Frame,
     InputError,
     Sensor,
@@ -86,14 +85,6 @@ def test_without_edges_every_object_has_its_own_filter_exactly():
             assert got == expected
 
 
-def test_classical_settings_have_no_edges_and_others_have():
-    frames = seen(np.random.default_rng(0), braking_platoon, np.arange(0, 2, 0.1))
-    for edges, expected in (((), 0), ((Following(),), 3)):
-        tracker = Tracker(TrackerSettings(edges=edges))
-        run(tracker, frames)
-        assert tracker.graph.edge_count == expected
-
-
 def test_a_node_that_dies_leaves_its_information_and_its_neighbours():
     tracker = Tracker(TrackerSettings(association=AssociationSettings(relink_above=1.0)))
     run(tracker, seen(np.random.default_rng(0), braking_platoon, np.arange(0, 2, 0.1)))
@@ -162,13 +153,6 @@ def test_a_rule_that_makes_no_sense_is_named_and_nothing_has_happened():
     again = Tracker(TrackerSettings(edges=()))
     again.restore(broken.snapshot())
     assert columns(again.step(later)) == columns(untouched.step(later))
-
-
-def test_an_empty_table_of_detections_with_a_graph():
-    tracker = Tracker()
-    run(tracker, seen(np.random.default_rng(0), braking_platoon, np.arange(0, 1, 0.1)))
-    nothing = tracker.step(Frame(1.0, "lidar", Detections.empty()))
-    assert nothing.id.tolist() == [1, 2, 3, 4]
 
 
 def braking_behind_a_wall(method, estimator="kalman", gap=4.5):
@@ -272,14 +256,6 @@ def test_late_frames_of_objects_born_since(estimator):
     assert tracks.boxes.position[1, 0] == pytest.approx(0.0, abs=0.1)
 
 
-def test_an_estimator_that_is_none_is_refused():
-    expected = (
-        "unknown estimator 'kallman'; did you mean 'kalman'. Expected one of: kalman, isam2, fixed-lag, or MODULE:NAME"
-    )
-    with pytest.raises(InputError, match=expected):
-        TrackerSettings(estimator="kallman")
-
-
 @pytest.mark.parametrize("edges", [(), TrackerSettings().edges])
 def test_every_estimator_takes_the_same_turns(edges):
     """Two that turn, one behind the other, of which one is not detected at last."""
@@ -359,18 +335,3 @@ def test_tracks_live_on_the_other_sensor_while_one_is_out(method):
 
 
 # A tracker goes on from a snapshot as if nothing had happened in between
-
-
-@pytest.mark.parametrize(("estimator", "tolerance"), [("kalman", 0.0), ("isam2", 1e-9), ("fixed-lag", 1e-9)])
-def test_going_on_from_a_snapshot(estimator, tolerance):
-    cars = straight([[0, 0], [12, 0], [24, 0], [0, 4]], [[10, 0], [10, 0], [10, 0], [6, 0]])
-    frames = seen(np.random.default_rng(0), cars, np.arange(40) / 10)
-    settings = TrackerSettings(estimator=estimator)
-    tracker = Tracker(settings)
-    run(tracker, frames[:20])
-    snapshot = tracker.snapshot()
-    expected = run(tracker, frames[20:])
-    for again in (tracker, Tracker(settings), tracker):  # the same one, a fresh one, and once more
-        again.restore(snapshot)
-        assert_same(expected, run(again, frames[20:]), tolerance)
-    assert any(len(tracks) for tracks in expected)

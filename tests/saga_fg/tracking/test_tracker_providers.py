@@ -1,7 +1,5 @@
 """Providers of factors in the tracker, nodes of the map by tiles, and predictions."""
 
-import copy
-import pickle
 from dataclasses import replace
 from functools import partial
 
@@ -22,7 +20,7 @@ from saga_fg.tracking.map_nodes import Element, elements, in_known_names
 from saga_fg.types.boxes import MAX_POSITION
 from saga_fg.types.frame import Detection, Detections
 from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight, Wall
-from tests.saga_fg.traffic_frames import assert_same, columns, frame, run, seen, straight
+from tests.saga_fg.traffic_frames import assert_same, frame, run, seen, straight
 
 PLACE = np.array([5e5, -3e5])  # of the scene in the world
 CARS = straight(PLACE + np.array([(0.0, 3.0), (9.0, 3.2), (0.0, -40.0)]), [(1.2, 0.4), (1.2, 0.4), (1.0, 0.0)])
@@ -100,22 +98,6 @@ def test_what_leads_to_no_provider_is_refused(subtests):
             Tracker(TrackerSettings(estimator="isam2", providers=(name,)))
 
 
-def test_variables_have_the_names_of_their_classes_and_times():
-    class Named:
-        name = "names"
-
-        def __init__(self) -> None:
-            self.seen: list[str] = []
-
-        def factors(self, view: GraphView) -> Additions:
-            self.seen += [str(one) for one in view.now(OBJECT).values()]
-            return Additions()
-
-    named = Named()
-    run(Tracker(ISAM2, providers=[named]), frames(3))
-    assert named.seen[-3:] == ["car 1 at 0.20 s", "car 2 at 0.20 s", "car 3 at 0.20 s"]
-
-
 @pytest.mark.parametrize(
     ("residual", "message"),
     [
@@ -142,17 +124,6 @@ def test_a_faulty_factor_is_named_and_the_tracker_goes_on(residual, message):
         tracker.step(frames()[10])
     provider.broken = False
     assert_same(tracker.step(frames()[10]), untouched.step(frames()[10]), 1e-6, 1e-4)
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda t: pickle.loads(pickle.dumps(t))])
-def test_trackers_with_providers_can_be_copied_and_look_ahead(copied):
-    tracker, watched = Tracker(ISAM2, providers=[Range()]), Tracker(ISAM2, providers=[Range()])
-    for f in frames()[:8]:
-        assert_same(tracker.step(f), watched.step(f), 1e-4, 1e-2)
-        watched.tracks(f.timestamp + 0.7)
-    twin = copied(tracker)
-    for f in frames()[8:]:
-        assert_same(tracker.step(f), twin.step(f), 1e-4, 1e-2)
 
 
 def test_providers_from_the_configuration():
@@ -342,16 +313,6 @@ def test_headings_turn_with_the_velocity():
     assert (np.diff(found.yaw[:, 0]) > 0.02).all()
     course = np.arctan2(found.velocity[:, 0, 1], found.velocity[:, 0, 0])
     assert np.diff(found.yaw[:, 0]) == pytest.approx(np.diff(course), abs=1e-6)
-
-
-@pytest.mark.parametrize("estimator", ["kalman", "isam2", "fixed-lag"])
-def test_looking_ahead_leaves_no_trace(estimator):
-    silent, watched = followed(estimator, until=1.0), followed(estimator, until=1.0)
-    for t in np.arange(1.0, 3.0, 0.1):
-        seen_now = frame(t, braking(t), label=["truck", "car", "car"])
-        watched.predict([0.0, 0.3, 7.0], joint=True)
-        watched.tracks(t + 0.7)
-        assert columns(watched.step(seen_now)) == columns(silent.step(seen_now))
 
 
 def test_only_what_is_reported_is_predicted_and_what_can_be():

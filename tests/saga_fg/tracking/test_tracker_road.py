@@ -412,15 +412,3 @@ def test_newcomers_start_at_the_speed_of_their_leader_and_in_doubt():
     assert newcomer.id.tolist() == [1, 2]
     known = np.isfinite(known_velocities(newcomer.boxes.velocity, newcomer.velocity_covariance))
     assert known.all(axis=1).tolist() == [True, False]
-
-
-def test_a_snapshot_remembers_the_traffic():
-    settings = TrackerSettings(edges=(), traffic=ON)
-    tracker, fresh = Tracker(settings), Tracker(settings)
-    for k in range(20):
-        tracker.step(frame(0.1 * k, [(1.2 * k, 0.0)]))
-    fresh.restore(tracker.snapshot())
-    later = frame(2.0, [(24.0, 0.0), (9.0, 0.0)])
-    expected = tracker.step(later).boxes.velocity
-    assert expected[1, 0] > 5
-    np.testing.assert_array_equal(fresh.step(later).boxes.velocity, expected)

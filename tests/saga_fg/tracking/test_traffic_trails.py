@@ -260,14 +260,6 @@ def test_every_estimator_takes_the_same_paths(estimator, subtests):
             assert_same(first, second, 1e-7, 1e-6)
 
 
-def test_trails_are_part_of_a_snapshot():
-    (tracker,), _ = driven((ON,), gap=0.5)
-    before, later = tracker.snapshot(), frame(5.6, [arc(np.array(-20 + SPEED * 5.6))[0]], yaw=0.5)
-    first = tracker.step(later).boxes.position
-    tracker.restore(before)
-    assert np.array_equal(tracker.step(later).boxes.position, first)
-
-
 def test_where_trails_part_the_place_is_less_certain():
     """A car that is hidden at a fork of two trails may be on either."""
     trails = along(*arc(np.arange(-20, 40, 1.0)))
