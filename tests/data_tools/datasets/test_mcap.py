@@ -13,6 +13,7 @@ pytest.importorskip("rosbags")
 
 from data_tools.datasets.mcap.dataset import McapRecording, RecordingOptions
 from data_tools.datasets.mcap.objects import nanoseconds
+from data_tools.datasets.mcap.recording import definition, plain_type
 from saga_fg import InputError
 from saga_fg.numerics.geometry import yaw_transform
 from tests.data_tools import mcap_example as example
@@ -311,3 +312,11 @@ def test_chunks_that_are_damaged_are_one_line(tmp_path):
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"^[^\n]*drive\.mcap: [^\n]*$"):
         read(path)
+
+
+def test_definitions_hold_all_that_they_are_made_of():
+    text = definition("autoware_auto_perception_msgs/msg/TrackedObjects")
+    assert text == definition(plain_type("autoware_perception_msgs/TrackedObjects"))
+    for part in ("MSG: unique_identifier_msgs/UUID", "uint8[16] uuid", "MSG: builtin_interfaces/Time"):
+        assert part in text
+    assert definition("std_msgs/String") is None

@@ -7,6 +7,7 @@ import pytest
 
 from data_tools.metrics import (
     SceneMetrics,
+    coverage,
     match_scene,
     nees,
     scene_metrics,
@@ -155,3 +156,15 @@ def test_empty_scenes_and_moments_that_differ():
 
 
 # Consistency figures
+
+
+def test_nees_of_consistent_estimates_lies_in_its_band():
+    rng = np.random.default_rng(4)
+    L = rng.normal(size=(500, 2, 2))
+    covariance = L @ np.swapaxes(L, 1, 2) + 0.1 * np.eye(2)
+    error = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.normal(size=(500, 2)))
+    values = nees(error, covariance)
+    assert abs(values.mean() - 2) < 4 * np.sqrt(4 / 500)  # chi-squared with 2 degrees of freedom
+    assert nees(2 * error, covariance) == pytest.approx(4 * values)
+    for p in (0.5, 0.9, 0.99):
+        assert abs(coverage(values, p) - p) < 4 * np.sqrt(p * (1 - p) / 500)
