@@ -177,21 +177,6 @@ def test_an_interrupt_leaves_nothing_behind(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_interrupt_leaves_an_earlier_result_as_it_was(tmp_path, monkeypatch):
-    output = tmp_path / "out"
-    output.mkdir()
-    (output / "index.html").write_text("earlier")
-
-    def interrupted(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("pipelines.demo.compare", interrupted)
-    result = saga_fg("demo", "--output", output)
-    assert result.exit_code == 130
-    assert [(path.name, path.read_text()) for path in output.iterdir()] == [("index.html", "earlier")]
-    assert list(tmp_path.iterdir()) == [output]
-
-
 def test_an_output_that_cannot_be_written_is_noticed_before_any_work(tmp_path, monkeypatch):
     monkeypatch.setattr("pipelines.demo.compare", lambda *_, **__: pytest.fail("work was done"))
     said = refused("demo", "--output", tmp_path / "none" / "out")

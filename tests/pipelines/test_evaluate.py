@@ -14,7 +14,7 @@ from data_tools.metrics import SceneMetrics, nuscenes_tracking_metrics
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.cli import app
 from pipelines.config import load_config
-from pipelines.demo import METHODS, Comparison, compare, comparison_table, hardest_moment, run_demo
+from pipelines.demo import METHODS, Comparison, compare, hardest_moment
 from saga_fg import InputError, Scene
 from tests.data_tools.kitti_example import write_sequence
 from tests.data_tools.nuscenes_random_drive import VERSION, write_random_drive
@@ -162,13 +162,6 @@ def test_all_methods_see_the_same_scenes(comparison):
             assert run.frames == sum(frame.timestamp <= run.scene.timestamps[-1] for frame in run.scene.frames)
 
 
-def test_the_table_has_a_row_for_each_method(comparison):
-    table = comparison_table(comparison, "title")
-    assert [row[0] for row in table.rows] == list(METHODS)
-    assert all(len(row) == len(table.columns) for row in table.rows)
-    assert float(table.rows[2][1]) == pytest.approx(comparison.metrics["saga"].position.rmse, abs=5e-4)
-
-
 def test_a_scene_without_ground_truth_cannot_be_compared():
     class Blind:
         scenes = ("a",)
@@ -193,12 +186,6 @@ def test_the_moment_shown_has_the_most_moving_hidden_objects(comparison):
 
     scenes = [run.scene for run in comparison.runs["saga"]]
     assert hidden(run.scene, moment) == max(hidden(scene, k) for scene in scenes for k in range(len(scene)))
-
-
-def test_the_demo_writes_a_page(tmp_path):
-    result = run_demo(tmp_path / "out", load_config("simulated"), SHORT, scenes=1)
-    assert result.page.read_text(encoding="utf-8").startswith("<!doctype html>")
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["index.html"]
 
 
 def test_the_command_prints_the_table(tmp_path, monkeypatch):

@@ -1,7 +1,6 @@
 """A new dataset in one file, the example of the documentation: installed as a package, it has all verbs."""
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from data_tools.datasets import source
 from data_tools.datasets.source import DatasetSource
 from saga_fg.errors import InputError
 from saga_fg.parts import offered
-from tests.pipelines.command import COMMAND, done, refused, saga_fg
+from tests.pipelines.command import done, refused, saga_fg
 
 PAGE = Path(__file__).parents[2] / "docs" / "guides" / "parts.md"
 
@@ -107,18 +106,6 @@ def test_by_module_and_class_it_need_not_be_installed(square, tmp_path):
         ("none_such:A", "No module named 'none_such'"),
     ):
         assert message in refused("track", name, "--folder", square)
-
-
-def test_by_module_and_class_it_is_smoothed_on_ray(square, tmp_path):
-    pytest.importorskip("ray", reason="Ray comes with the extra ray")
-    run = ("smooth", "square:Square", "--folder", str(square), "-o")
-    assert saga_fg(*run, tmp_path / "serial").exit_code == 0
-    command = [*COMMAND, *run, str(tmp_path / "run"), "--ray", "local"]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-    assert done.returncode == 0, done.stderr
-    assert "2 scenes: 2 done, 0 unchanged, 0 failed" in done.stdout
-    assert rows(tmp_path / "run" / "labels") == (tmp_path / "serial" / "labels.csv").read_text()
 
 
 def test_a_broken_package_is_named_and_hinders_no_other(packages, square, tmp_path):

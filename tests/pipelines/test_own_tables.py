@@ -13,7 +13,7 @@ from pipelines.config import load_config
 from pipelines.report.page import read_run_record
 from saga_fg import Boxes, Detections, Frame
 from saga_fg.tracking import Tracker
-from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight
+from saga_fg.types.road_map import RoadMap
 from tests.pipelines.strangers_tables import T0, rows, run_line, saga_fg, write
 
 
@@ -429,39 +429,3 @@ def test_a_vehicle_that_appears_in_the_middle_of_another_is_predicted_all_the_sa
             assert (np.linalg.eigvalsh(predicted.joint_covariance) > -1e-6).all()
             first = predicted.position[:, np.argmin(predicted.id), 0]
             assert SPEED * 1.9 < first[0] < first[1] < SPEED * 1.9 + 1.2 * SPEED * 5
-
-
-def test_where_a_lane_ends_vehicles_are_predicted_straight_on():
-    light = TrafficLight("light", (100.0, 5.0))
-    line = StopLine("line", (100.0, 2.0), (100.0, -2.0), "light")
-    ending = RoadMap((light,), (line,), (Lane("ending", ((-50.0, 0.0), (20.0, 0.0))),))
-    tracker = new_tracker()
-    for k in range(20):
-        tracker.step(frame(k / 10, [(SPEED * k / 10, 0.0)], ending))
-    predicted = tracker.predict([1.0, 3.0, 5.0])
-    x, y = predicted.position[:, 0].T
-    assert (np.diff(x) > 0).all()
-    assert x[1] > 25  # beyond the end of the lane
-    assert np.abs(y).max() < 1.0
-
-
-def test_a_light_that_nobody_reports_stops_nobody_for_sure():
-    """Colours are inferred from traffic: a car that comes at full speed 12 m before the line runs no red light."""
-    light = TrafficLight("light", (40.0, 5.0))
-    line = StopLine("line", (40.0, 2.0), (40.0, -2.0), "light")
-    road = RoadMap((light,), (line,), (Lane("lane", ((-50.0, 0.0), (80.0, 0.0))),))
-    tracker = new_tracker()
-    for k in range(36):
-        tracker.step(frame(k / 10, [(SPEED * k / 10, 0.0)], road))
-    belief = tracker.map_nodes.belief("light")
-    assert sum(belief.values()) == pytest.approx(1.0)
-    assert belief["green"] > 0.5
-    assert tracker.predict([3.0]).position[0, 0, 0] > 45
-
-
-def test_traffic_without_a_map_has_no_nodes_of_one():
-    tracker = new_tracker()
-    for k in range(5):
-        tracker.step(frame(k / 10, [(SPEED * k / 10, 0.0)]))
-    assert len(tracker.map_nodes) == 0
-    assert len(tracker.predict([1.0])) == 1

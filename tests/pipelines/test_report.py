@@ -153,13 +153,6 @@ def test_charts_say_what_the_errors_are():
     np.testing.assert_allclose(mine.y, SHARES, atol=0.06)
 
 
-def test_latencies_are_counted():
-    chart = latency_chart(np.array([1.0] * 98 + [3.0, 500.0]))
-    assert chart.title.startswith("Time in the tracker: median 1.0 ms")
-    assert sum(chart.series[0].y) == 100
-    assert len(chart.series[0].x) == len(chart.series[0].y) + 1
-
-
 def test_a_record_is_read_back_and_a_broken_one_refused(tmp_path):
     result = tmp_path / "tracks.json"
     assert read_run_record(result) is None

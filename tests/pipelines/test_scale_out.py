@@ -47,11 +47,6 @@ def run(inputs: list[Part], output: Path, task: SceneTask = TRACK, workers: int 
     return run_scenes(inputs, len(inputs), task, output, new_pool)
 
 
-def written(output: Path) -> dict[str, int]:
-    """Times at which the files of a run were written, ns."""
-    return {str(path): path.stat().st_mtime_ns for path in output.glob("*/*")}
-
-
 def test_results_do_not_depend_on_the_number_of_workers(tmp_path):
     inputs = write_recordings(tmp_path / "in", 5)
     reports = [run(inputs, tmp_path / str(workers), workers=workers) for workers in (0, 2)]
@@ -69,16 +64,6 @@ def test_results_do_not_depend_on_the_number_of_workers(tmp_path):
         }  # tracks are reported from their second hit on
     assert not list(tmp_path.rglob("*.tmp"))
     assert not list(tmp_path.rglob(".scratch"))
-
-
-def test_a_second_run_does_nothing_again(tmp_path):
-    inputs = write_recordings(tmp_path / "in", 3)
-    run(inputs, tmp_path / "out")
-    before = written(tmp_path / "out")
-    report = run(inputs, tmp_path / "out")
-    assert report.unchanged == ["a00", "a01", "a02"]
-    assert report.counts["frames"] == 45
-    assert written(tmp_path / "out") == before
 
 
 def test_what_has_changed_is_done_again_and_nothing_else(tmp_path):

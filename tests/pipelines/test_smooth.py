@@ -348,13 +348,3 @@ def test_an_object_from_far_away_reaches_back(subtests):
             smoothing = replace(config.smoothing, backward_time=1.0, backward_distance=50.0)
             there = approaching(first, replace(config, smoothing=smoothing), with_pose)
             assert there == [0] * begins + [1] * (50 - begins)
-
-
-def test_labels_of_a_recorded_crowd_are_better_than_its_detections(recordings):
-    root = recordings / "nuscenes"
-    found = {"lidar": root / "detections" / "megvii_lidar.json"}
-    scene = NuScenes(root, "v1.0-mini", found, ["scene-0103"], ground_truth=True).scene("scene-0103")
-    labels = smooth_scene(scene, load_smooth_config("nuscenes")).tracks
-    for label in ("pedestrian", "car", "bicycle"):
-        f = error_summary(errors(scene, labels, label))
-        assert f.position < f.detection, label

@@ -73,14 +73,6 @@ def test_two_sensors_and_chosen_scenes(simulated, tmp_path):
     } <= set(NuScenes(simulated, "v1.0-mini", {}).scene("scene-0002").tokens)
 
 
-def test_the_same_command_writes_the_same_file(simulated, tmp_path):
-    contents = []
-    for name in ("a.json", "b.json"):
-        saga_fg(*arguments(simulated, tmp_path / name), "--split", "all")
-        contents.append((tmp_path / name).read_bytes())
-    assert contents[0] == contents[1]
-
-
 def test_mistakes_end_in_one_line_and_no_file(simulated, tmp_path):
     for extra, message in [
         ((), "expected either --split NAME or --scenes A,B"),
@@ -130,21 +122,6 @@ def test_tables_of_ones_own(tmp_path):
             read = list(csv.DictReader(file))
         assert [float(row["timestamp"]) for row in read] == [k / 10 for k in range(late, 10)]
         assert {row["id"] for row in read} == {"1"}
-
-
-def test_kitti_recordings(recordings, tmp_path):
-    kitti = recordings / "kitti"
-    done("track", "kitti", "--dataroot", kitti, "--detections", kitti / "detections" / "pointrcnn",
-        "--sequences", "0000,0017", "--output", tmp_path / "out",)  # fmt: skip
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        "0000.txt",
-        "0017.txt",
-        "run.json",
-        "tracks.csv",
-    ]
-    lines = (tmp_path / "out" / "0000.txt").read_text().splitlines()
-    assert len(lines) > 100
-    assert all(len(line.split()) == 18 for line in lines)
 
 
 def test_nuscenes_recordings(recordings, tmp_path):

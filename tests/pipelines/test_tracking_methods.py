@@ -1,6 +1,5 @@
 """Tracking with nonlinear motion, radars, confused classes and every estimator."""
 
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +8,8 @@ import pytest
 from benchmarks.recording_sets import recording_set
 from data_tools.datasets.detection_files import read_detections, read_tracks
 from data_tools.metrics import SceneMetrics, scene_metrics
-from data_tools.simulator import SimulatedTraffic, SimulatorSettings, lidar, radar, simulate_scene
-from pipelines.config import TrackConfig, load_config
+from data_tools.simulator import SimulatedTraffic, SimulatorSettings, simulate_scene
+from pipelines.config import load_config
 from pipelines.configuration.reading import read_settings
 from pipelines.learning import learn_noise, learned_fragment
 from pipelines.smoothing import load_smooth_config, smooth_scene
@@ -21,7 +20,6 @@ from saga_fg.estimators import GraphFilter
 from saga_fg.learning import learn_confusion
 from saga_fg.model.discretisation import Transition
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Scene
 from tests.pipelines.command import done
 
 SETTINGS = """
@@ -136,49 +134,7 @@ def test_modes_know_what_stands_and_do_not_lose_it_when_it_departs(estimator):
     assert errors[1][1] < 1.3 * errors[0][1]
 
 
-def test_a_tracker_with_nonlinear_edges_is_copied_and_goes_on_alike():
-    one = tracker("fixed-lag", "{kind: repulsion}", motion="mixture")
-    frames = []
-    for k in range(8):
-        seen = [Detection("pedestrian", (0.2 * i + 0.01 * k, 0.5, 1.0), score=0.9) for i in range(3)]
-        seen.append(Detection("car", (0.8 * k, 9.0, 1.0), score=0.9))
-        frames.append(Frame(k / 10, "lidar", Detections.of(seen)))
-    for frame in frames[:5]:
-        one.step(frame)
-    twin = pickle.loads(pickle.dumps(one))
-    for frame in frames[5:]:
-        np.testing.assert_array_equal(one.step(frame).boxes.position, twin.step(frame).boxes.position)
-
-
 # Gain of the range rate of a radar for the velocity of tracks, on simulated traffic
-
-SEEDS = range(500, 506)
-TRAFFIC = SimulatorSettings(duration=6.0, sensors={"lidar": lidar(), "radar": radar()})
-
-
-def lidar_alone(scene: Scene) -> Scene:
-    """The scene without the frames of other sensors."""
-    return replace(scene, frames=tuple(frame for frame in scene.frames if frame.sensor == "lidar"))
-
-
-def square_sums(scene: Scene, config: TrackConfig) -> tuple[float, float]:
-    """(sum of squares, number) of the velocity errors of matched visible objects."""
-    tracks = track_scene(scene, config.new_tracker("saga")).tracks
-    assert scene.ground_truth is not None
-    return scene_metrics(scene.ground_truth, tracks).velocity.square_sums
-
-
-def test_range_rates_make_velocities_better_than_the_radars_positions_do():
-    """In the mean over scenes: single false matches tell more than that in some."""
-    config = load_config("simulated")
-    blind = replace(config.sensors["radar"], use_velocity=False)
-    deaf = replace(config, sensors={**config.sensors, "radar": blind})
-    scenes = [simulate_scene(TRAFFIC, seed) for seed in SEEDS]
-    both = np.array([square_sums(s, config) for s in scenes])
-    alone = np.array([square_sums(lidar_alone(s), config) for s in scenes])
-    positions = np.array([square_sums(s, deaf) for s in scenes])
-    mean_squares = [total / count for total, count in (each.sum(axis=0) for each in (both, alone, positions))]
-    assert mean_squares[0] < min(mean_squares[1:])
 
 
 def test_a_table_with_range_rates_ends_in_tracks_that_move_along_the_line_of_sight(tmp_path):
