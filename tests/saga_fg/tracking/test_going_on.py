@@ -11,8 +11,8 @@ import pytest
 from pipelines.serving.state import TreeWriter, read_tree
 from saga_fg import ConstantAcceleration, Curvilinear, Detections, Sensor, Tracker, TrackerSettings
 from saga_fg.model.edge_rules import Repulsion
+from saga_fg.model.map_rules import GreenLight, RedLight
 from saga_fg.model.sensor import NoiseModel
-from saga_fg.model.stop_lines import GreenLight, RedLight
 from saga_fg.tracking import AssociationSettings, ClassSettings
 from saga_fg.tracking.traffic import SpeedPriorSettings, TrafficSettings
 from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight
