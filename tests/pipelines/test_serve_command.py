@@ -7,12 +7,14 @@ import socket
 import stat
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
 
 from pipelines.serving import StreamClient, parse_address
 from saga_fg import InputError
+from tests.pipelines.command import refused
 from tests.pipelines.running_service import COMMAND, frame, serving, status, wait_for
 
 
@@ -83,19 +85,15 @@ def test_a_socket_left_behind_is_taken_over_and_a_file_is_not(tmp_path):
         assert client.ask({"type": "status"})["frames"] == 0
     file = tmp_path / "notes.txt"
     file.write_text("mine")
-    done = subprocess.run([*COMMAND, "serve", "--listen", str(file)], capture_output=True, text=True, check=False)
-    assert (done.returncode, file.read_text()) == (2, "mine")
+    refused("serve", "--listen", file)
+    assert file.read_text() == "mine"
 
 
 def test_other_machines_are_refused_and_nobody_there_is_one_line():
-    done = subprocess.run([*COMMAND, "serve", "--listen", "0.0.0.0:0"], capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "--allow-remote" in done.stderr
+    assert "--allow-remote" in refused("serve", "--listen", "0.0.0.0:0")
     with pytest.raises(InputError, match="nobody answers there"):
         StreamClient(parse_address("127.0.0.1:9"))
-    done = subprocess.run([*COMMAND, "status", "/nowhere/x.sock"], capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr.startswith("error: /nowhere/x.sock: nobody answers there")
+    assert refused("status", "/nowhere/x.sock").startswith("error: /nowhere/x.sock: nobody answers there")
 
 
 OTHER_SERVICES = [
@@ -107,16 +105,19 @@ OTHER_SERVICES = [
 
 
 def test_the_status_of_another_service_is_one_line():
+    def answer(listening, said):
+        connection, _ = listening.accept()
+        with connection:
+            connection.recv(1000)
+            connection.sendall(said)
+
     for said, message in OTHER_SERVICES:
         with socket.create_server(("127.0.0.1", 0)) as listening:
+            other = threading.Thread(target=answer, args=(listening, said))
+            other.start()
             where = f"127.0.0.1:{listening.getsockname()[1]}"
-            with subprocess.Popen([*COMMAND, "status", where], stderr=subprocess.PIPE, text=True) as asking:
-                connection, _ = listening.accept()
-                with connection:
-                    connection.recv(1000)
-                    connection.sendall(said)
-                _, error = asking.communicate()
-        assert asking.returncode == 2
+            error = refused("status", where)
+            other.join()
         assert error.startswith(f"error: {where}: {message}")
         assert len(error.splitlines()) == 1
 
