@@ -14,7 +14,7 @@ import pytest
 
 from pipelines.serving import StreamClient, parse_address
 from saga_fg import InputError
-from tests.pipelines.command import refused
+from tests.pipelines.command import done, refused
 from tests.pipelines.running_service import COMMAND, frame, serving, status, wait_for
 
 
@@ -65,11 +65,8 @@ def test_a_unix_socket_is_for_its_owner_and_gone_afterwards(tmp_path):
         with StreamClient(address) as client:
             client.send(frame(0))
             assert client.receive()["type"] == "tracks"
-        done = subprocess.run([*COMMAND, "status", str(path), "--json"], capture_output=True, text=True, check=True)
-        assert json.loads(done.stdout)["frames"] == 1
-        second = subprocess.run([*COMMAND, "serve", "--listen", str(path)], capture_output=True, text=True, check=False)
-        assert second.returncode == 2
-        assert "another server listens there" in second.stderr
+        assert json.loads(done("status", path, "--json").stdout)["frames"] == 1
+        assert "another server listens there" in refused("serve", "--listen", path)
         server.send_signal(signal.SIGTERM)
         _, errors = server.communicate(timeout=60)
         assert server.returncode == 143
