@@ -28,6 +28,7 @@ from data_tools.datasets.source import (
 from data_tools.files.input_files import expanded, local_copy, name_of
 from saga_fg.errors import InputError
 from saga_fg.tables.column_names import pairs
+from saga_fg.tracking.dense_traffic import seems_dense_traffic
 from saga_fg.types.dataset import Dataset, Scene
 
 if TYPE_CHECKING:
@@ -97,6 +98,12 @@ class DetectionFileSource(DatasetSource):
     coordinates: Literal["world", "ego", "sensor", "camera"] | None = option(import_options.COORDINATES, None)
     sort: bool = option(import_options.SORT, False)
     as_given: bool = option(import_options.AS_GIVEN, False)
+    like: Literal["plain", "dense"] | None = option(
+        "Settings to begin with: dense for road traffic seen by a sensor that stands or hovers, plain for all else.  "
+        "[default: what the first rows look like]",
+        None,
+        verbs=("track",),
+    )
     table_import: TableImport | None = option(import_options.IMPORT, None, flag="--import", metavar="FILE")
     truth_import: TableImport | None = option(
         "YAML file with the same, for --truth alone.", None, flag="--truth-import", metavar="FILE", verbs=JUDGED
@@ -120,6 +127,13 @@ class DetectionFileSource(DatasetSource):
             self.as_given,
         )
         return own.over(self.table_import or TableImport())
+
+    def dense_traffic(self) -> str:
+        """Why the settings for dense traffic fit, "" if they do not: `like`, or what the first rows look like."""
+        if self.like is not None or not self.detections or "://" in self.detections[0]:
+            return "--like dense" if self.like == "dense" else ""
+        first = next(read_scenes_in_parts(expanded(self.detections)[0], how=self.how), None)
+        return "" if first is None else seems_dense_traffic(first.frames)
 
     def __str__(self) -> str:
         return ", ".join(name_of(place) for place in self.detections or ()) or "a table of tracks"

@@ -61,7 +61,8 @@ def _evaluate(
     """
     _require_truth(source)
     if result is None:
-        found, innovations = _tracked(source, tracker.configured(source.family, config), tracker.method)
+        settings = tracker.configured(options.family_of(source, config), config)
+        found, innovations = _tracked(source, settings, tracker.method)
     else:
         given = {name: value for name, value in vars(tracker).items() if value != getattr(TrackerOptions, name)}
         for name, value in (given | ({} if config is None else {"config": config})).items():
@@ -181,7 +182,7 @@ def _benchmark(
     if not source.written.all_tracks:
         raise InputError(f"benchmark {source.name}: expected a dataset with official results: saga-fg benchmark --help")
     options.apart(output, *input_files(source))
-    task = TrackTask(tracker.configured(source.family, config), tracker.method, source)
+    task = TrackTask(tracker.configured(options.family_of(source, config), config), tracker.method, source)
     run = run_at_scale(source, task, output, scale)
     exit_on_failures(run)
     with working("writing the submission"):

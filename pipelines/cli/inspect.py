@@ -83,6 +83,10 @@ def inspect_table(
         typer.echo("  rows are not in order of time; add --sort")
     if survey.raw.present("ego_x").any() and "coordinates" not in survey.raw.columns and not survey.how.coordinates:
         typer.echo("\nPositions are taken for world coordinates; if the vehicle is their origin: --coordinates ego")
+    if survey.dense_traffic and not survey.has_identities:
+        typer.echo(
+            f"\nDense road traffic: {survey.dense_traffic}. `track` takes settings for it, with --like plain not."
+        )
     base_option = "" if import_file is None else f" --import {shlex.quote(str(import_file))}"
     _show_next(survey, table, base_option + _mended(survey, findings, given).options())
 

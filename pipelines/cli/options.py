@@ -13,6 +13,7 @@ from typing import Annotated, Any, get_args, get_type_hints
 
 import typer
 
+from data_tools.datasets.detection_file_source import DetectionFileSource
 from data_tools.datasets.source import DatasetSource, Verb, dataset_names, dataset_source
 from data_tools.files.atomic_files import check_writable, write_text
 from pipelines.cli.console import ReportingGroup, new_command, new_group, set_up_logging
@@ -103,6 +104,21 @@ class TrackerOptions:
             raise InputError(f"--lag {self.lag:g}: goes with --estimator fixed-lag")
         association_fits(self.method, self.association)
         return settings.with_estimator(self.estimator, self.lag).with_association(self.association)
+
+
+def family_of(source: DatasetSource, config: Path | None) -> str | Path:
+    """The shipped settings that fit a dataset, which the file `config` lies over.
+
+    A table of dense traffic has its own, which is told, unless there is such a file: its meaning depends on no data.
+    """
+    why = ""
+    if isinstance(source, DetectionFileSource) and (config is None or source.like is not None):
+        why = source.dense_traffic()
+    if not why:
+        return source.family
+    if not why.startswith("--"):
+        typer.echo(f"settings for dense traffic: {why}; --like plain takes others", err=True)
+    return "dense"
 
 
 @dataclass(frozen=True)

@@ -112,7 +112,7 @@ def _config(
         settings = load_settings(cls, file) if file else cls()
     else:
         load = {"smoothing": load_smooth_config, "slam": load_slam_config, "tracking": load_config}[name]
-        family = kind if kind == "heterogeneous" else dataset_source(kind).family
+        family = kind if kind in ("heterogeneous", "dense") else dataset_source(kind).family
         settings = load(family, file)
     text = write_settings(settings) if full else POINTER + write_settings(settings, selection=FIRST[name])
     typer.echo(text, nl=False)

@@ -170,13 +170,14 @@ def _track(
     verbose: options.Verbose = False,
 ) -> None:
     """Track the detections of recordings."""
-    settings, method = tracker.configured(source.family, config), tracker.method
+    family, method = options.family_of(source, config), tracker.method
+    settings = tracker.configured(family, config)
     options.apart(output, *input_files(source))
     options.check_learn_offsets(beside.learn_offsets, method, scale.wanted)
     if beside.explain and scale.wanted:
         raise InputError("--explain: goes without --workers and --ray")
     kept, horizons = journal_of(output) if beside.explain else None, options.horizons(beside.predict, method)
-    checks = Checks(settings.of_method(method), load_config(source.family), source.option_for)
+    checks = Checks(settings.of_method(method), load_config(family), source.option_for)
     if scale.wanted:
         checks.see_first(source)
         task = TrackTask(settings, method, source, horizons)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -13,6 +14,7 @@ from saga_fg.tables.column_names import TableImport
 from saga_fg.tables.columns import RawTable
 from saga_fg.tables.detections import Table, raw_table, scenes_of, table_like, tell
 from saga_fg.tables.plausibility import idle_rules
+from saga_fg.tracking.dense_traffic import DENSE_TRAFFIC, seems_dense_traffic
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker import Tracker
 from saga_fg.types.by_class import DEFAULT
@@ -41,7 +43,8 @@ def track(
     detections   a row for each: timestamp (s, or dates), x, y (m), and where known z, label, score, sensor, length,
                  width, height, yaw (rad), vx, vy, range_rate, cov_xx, cov_xy, cov_yy (m^2), scene, and ego_x,
                  ego_y, ego_yaw, the vehicle's pose; a row without x and y is a moment at which nothing was detected
-    settings     of the tracker; by default tracks are reported from their second detection on
+    settings     of the tracker; by default tracks are reported from their second detection on, and dense road traffic
+                 seen by a sensor that stands or hovers has settings of its own (`saga_fg.tracking.dense_traffic`)
     sensors      models by name of the sensor; by default the noise of each is told by its detections
     columns      names of columns in the table, by ours, where they are not found: {"x": "pos_e"}
     classes      our name of a class by that in the table, an empty one to leave its objects out
@@ -55,10 +58,11 @@ def track(
     whose contents contradict how it is read: units of angles, times, lengths or speeds, coordinates, exchanged columns.
     """
     how = TableImport(columns or {}, classes or {}, units or {}, coordinates, as_given=as_given)
-    settings = TrackerSettings(min_hits=2) if settings is None else settings
     sensors = UNKNOWN_SENSORS if sensors is None else sensors
     raw = raw_table(detections, how)
     scenes = scenes_of(raw)
+    if settings is None:
+        settings = fitting_settings(scenes)
     check_scenes(raw, scenes, settings, sensors)
     found = []
     for scene in scenes:
@@ -68,6 +72,15 @@ def track(
             name = {"scene": np.full(len(tracks["id"]), scene.name)} if "scene" in raw.columns else {}
             found.append({**name, **tracks})
     return table_like(detections, found or [Tracks.empty(0.0).table_columns()])
+
+
+def fitting_settings(scenes: Sequence[Scene]) -> TrackerSettings:
+    """Settings for scenes of which nothing is known, by what the first looks like; warns of those for dense traffic."""
+    why = seems_dense_traffic(scenes[0].frames) if scenes else ""
+    if not why:
+        return TrackerSettings(min_hits=2)
+    warnings.warn(f"settings for dense traffic: {why}; settings=TrackerSettings() takes others", stacklevel=3)
+    return DENSE_TRAFFIC
 
 
 def check_scenes(raw: RawTable, scenes: list[Scene], settings: TrackerSettings, sensors: Mapping[str, Sensor]) -> None:

@@ -429,3 +429,18 @@ def test_a_vehicle_that_appears_in_the_middle_of_another_is_predicted_all_the_sa
             assert (np.linalg.eigvalsh(predicted.joint_covariance) > -1e-6).all()
             first = predicted.position[:, np.argmin(predicted.id), 0]
             assert SPEED * 1.9 < first[0] < first[1] < SPEED * 1.9 + 1.2 * SPEED * 5
+
+
+def test_dense_traffic_is_recognised_unless_it_is_said_otherwise(tmp_path):
+    """Ten vehicles with headings at 10 Hz, from a sensor of which no pose is given."""
+    rows = [f"{k / 10},car,{k - 12 * n},{4 * (n % 2)},0.0" for k in range(20) for n in range(10)]
+    table = tmp_path / "above.csv"
+    table.write_text("\n".join(["timestamp,label,x,y,yaw", *rows]) + "\n")
+    assert "Dense road traffic: 10 vehicles at a time with headings, 10 Hz" in saga_fg("inspect", table).stdout
+    told, same = tmp_path / "told.csv", tmp_path / "same.csv"
+    line = "settings for dense traffic: 10 vehicles at a time with headings"
+    assert saga_fg("track", "file", table, "--output", told).output.count(line) == 1
+    saga_fg("track", "file", table, "--like", "dense", "--output", same)
+    assert same.read_bytes() == told.read_bytes()
+    assert "settings for" not in saga_fg("track", "file", table, "--like", "plain", "--output", same).output
+    assert same.read_bytes() != told.read_bytes()

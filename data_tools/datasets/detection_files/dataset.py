@@ -27,6 +27,7 @@ from saga_fg.tables.columns import (
     RawTable,
 )
 from saga_fg.tables.detections import DetectionTable, sorted_by_time
+from saga_fg.tracking.dense_traffic import seems_dense_traffic
 from saga_fg.types.dataset import Scene
 from saga_fg.types.finding import Finding
 
@@ -107,6 +108,7 @@ class TableSurvey:
     times     of each sensor in each scene
     findings    about the table as it is read now
     faults    why it cannot be read as it is, a text each
+    dense_traffic  why it looks like dense road traffic, "" if it does not
     """
 
     raw: RawTable
@@ -118,6 +120,7 @@ class TableSurvey:
     times: tuple[SensorTimes, ...]
     findings: tuple[Finding, ...]
     faults: tuple[str, ...] = ()
+    dense_traffic: str = ""
 
     @property
     def has_identities(self) -> bool:
@@ -136,12 +139,14 @@ def survey_table(path: Path, how: TableImport | None = None) -> TableSurvey:
     scattered = raw.length > ROWS and np.count_nonzero(np.diff(of_scene)) > of_scene.max()
     in_order = not backwards.any() and not scattered  # longer tables are read in parts, a scene after the other
     ordered = raw if in_order else sorted_by_time(raw)
-    findings = [] if not faults else raw.findings()
+    findings, dense = [] if not faults else raw.findings(), ""
     if not faults:
         try:
             table = DetectionTable(replace(ordered, columns={k: v for k, v in ordered.columns.items() if k in COLUMNS}))
             for name in table.scenes:
-                findings += table.scene(name).findings or ()
+                scene_of_table = table.scene(name)
+                findings += scene_of_table.findings or ()
+                dense = dense or seems_dense_traffic(scene_of_table.frames)
         except InputError as error:
             faults.append(str(error).removeprefix(f"{path}: "))
     known = {finding.kind: finding for finding in reversed(findings)}
@@ -157,6 +162,7 @@ def survey_table(path: Path, how: TableImport | None = None) -> TableSurvey:
         times=_times(ordered) if "timestamp" in raw.columns else (),
         findings=tuple(known.values()),
         faults=tuple(faults),
+        dense_traffic=dense,
     )
 
 

@@ -1,0 +1,80 @@
+"""Dense road traffic: a recording of it is recognised, and others are not."""
+
+import numpy as np
+import pytest
+
+from saga_fg import Tracker, TrackerSettings, track
+from saga_fg.tracking.dense_traffic import DENSE_TRAFFIC, seems_dense_traffic
+from tests.saga_fg.traffic_frames import frame, run
+
+TIMES = np.arange(0.0, 2.0, 0.1)
+
+
+def queue(count=6, step=1, **fields):
+    """Vehicles one behind the other, at 10 m/s."""
+    return [
+        frame(t, np.stack([10.0 * t - 12.0 * np.arange(count), np.zeros(count)], axis=1), **fields)
+        for t in TIMES[::step]
+    ]
+
+
+def moved(t):
+    world_T_ego = np.eye(4)
+    world_T_ego[0, 3] = 8.0 * t
+    return world_T_ego
+
+
+def test_traffic_seen_from_above_or_from_the_roadside_is_recognised():
+    assert "6 vehicles at a time with headings, 10 Hz" in seems_dense_traffic(queue())
+    assert seems_dense_traffic(queue(world_T_ego=np.eye(4))), "a sensor with a pose that stands"
+    assert seems_dense_traffic([*queue(), frame(1.95, [])]), "an empty frame says nothing"
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        pytest.param(queue(count=3), id="few"),
+        pytest.param(queue(step=5), id="2 Hz"),
+        pytest.param(queue(yaw=np.nan), id="no headings"),
+        pytest.param(queue(label="pedestrian"), id="a crowd"),
+        pytest.param([frame(t, np.full((6, 2), t), world_T_ego=moved(t)) for t in TIMES], id="moves"),
+        pytest.param([frame(t, []) for t in TIMES], id="nothing"),
+        pytest.param([], id="no frames"),
+    ],
+)
+def test_other_recordings_are_not(frames):
+    assert seems_dense_traffic(frames) == ""
+
+
+def test_a_hidden_follower_brakes_with_its_leader():
+    """Ten vehicles brake while the last one is hidden: it is nearer to the truth than with the plain settings."""
+
+    def place(t):
+        braking = np.maximum(t - 4.0, 0.0)
+        ahead = 10.0 * min(t, 4.0) + 10.0 * min(braking, 10 / 3) - 1.5 * min(braking, 10 / 3) ** 2
+        return np.stack([ahead - 12.0 * np.arange(10), np.zeros(10)], axis=1)
+
+    times = np.arange(0.0, 6.5, 0.1)
+    frames = [frame(t, place(t)[: 9 if t > 4.0 else 10]) for t in times]
+    errors = []
+    for settings in (DENSE_TRAFFIC, TrackerSettings(min_hits=2)):
+        tracker = Tracker(settings)
+        run(tracker, frames)
+        x = tracker.tracks(times[-1]).boxes.position[:, 0]
+        errors.append(np.abs(x - place(times[-1])[9, 0]).min())
+    assert errors[0] < 0.5 * errors[1]
+
+
+def test_a_table_of_it_is_tracked_with_its_settings():
+    pandas = pytest.importorskip("pandas")
+    rows = [
+        {"timestamp": one.timestamp, "label": "car", "x": x, "y": y, "yaw": 0.0}
+        for one in queue()
+        for x, y in one.detections.boxes.position[:, :2].tolist()
+    ]
+    table = pandas.DataFrame(rows)
+    with pytest.warns(UserWarning, match="settings for dense traffic: 6 vehicles"):
+        found = track(table)
+    by_name = track(table, DENSE_TRAFFIC)
+    assert found.equals(by_name)
+    assert not found.equals(track(table, TrackerSettings(min_hits=2)))
