@@ -77,7 +77,7 @@ def test_what_the_wheel_holds_works_on_its_own(wheel, tmp_path):
 # What an installation does wherever it is: imports are cheap, packages one's own, optional parts missed by name
 
 HEAVY = {"open3d", "scipy.stats", "matplotlib", "typer", "rich", "pandas", "dash", "torch"}
-OPTIONAL = ("open3d", "libusb_package", "pandas", "pyarrow", "ray", "fsspec", "mcap", "trackeval")
+OPTIONAL = ("open3d", "libusb_package", "pandas", "pyarrow", "rerun", "ray", "fsspec", "mcap", "trackeval")
 
 
 def python(folder: Path, *arguments: str, before: tuple[str, ...] = ()) -> subprocess.CompletedProcess[str]:

@@ -22,7 +22,7 @@ COMMANDS = {
     "learn": ("learn:learn_app", "Learn settings from recordings."),
     "review": ("review:review", "Correct labels on a page, those most worth a look first."),
     "report": ("report:report_app", "Make a page of a result: a player, figures, charts."),
-    "view": ("report:view_app", "See a result in space, in Foxglove."),
+    "view": ("report:view_app", "See a result in space, in rerun or Foxglove."),
     "benchmark": ("evaluate:benchmark_app", "Get the figures of a whole dataset, and the submission."),
     "slam": ("slam:slam_app", "Estimate the vehicle's path and a map, in one factor graph."),
     "explain": ("inspect:explain", "Tell the life of a track, or draw the running graph."),

@@ -53,14 +53,18 @@ report_app = dataset_commands(
 )
 
 Save = Annotated[
-    Path, typer.Option("--save", help="File to write, .mcap, for Foxglove (extra [mcap]).", metavar="FILE")
+    Path | None,
+    typer.Option(
+        "--save",
+        help="Write a file instead of opening the viewer: .rrd for rerun, .mcap for Foxglove (extra [mcap]).",
+        metavar="FILE",
+    ),
 ]
 
 
 def _view(
     source: DatasetSource,
     result: options.Result,
-    save: Save,
     slam: Annotated[
         Path | None,
         typer.Option("--slam", help="Folder that `saga-fg slam` wrote, of the only scene.", metavar="FOLDER"),
@@ -68,18 +72,20 @@ def _view(
     spacing: Annotated[
         float, typer.Option("--spacing", min=0.0, help="Thin the LiDAR's points to this, m; 0 leaves them out.")
     ] = 0.1,
+    save: Save = None,
     verbose: options.Verbose = False,
 ) -> None:
     """See a tracking result, with the ground truth, the detections and the LiDAR scans where they are there."""
-    options.apart(save, result, *input_files(source), option="--save")
+    if save is not None:
+        options.apart(save, result, *input_files(source), option="--save")
     _show(result, save, lambda: view.result_views(source, result, spacing), slam)
 
 
 view_app = dataset_commands(
     "view",
-    "See a result in space: boxes, tracks, ellipses, edges, graph, truth, LiDAR, landmarks (Foxglove).",
+    "See a result in space: boxes, tracks, ellipses, edges, graph, truth, LiDAR, landmarks (rerun or Foxglove).",
     _view,
-    ("view {result} --save tracks.mcap",),
+    ("view {result}", "view {result} --save tracks.mcap"),
     lambda source: {} if "scans" in source.shows else {"spacing": None},
 )
 
@@ -87,21 +93,26 @@ view_app = dataset_commands(
 @view_app.command()
 def slam(
     result: Annotated[Path, typer.Argument(help="Folder that `saga-fg slam scans` wrote.")],
-    save: Save,
+    save: Save = None,
     verbose: options.Verbose = False,
 ) -> None:
     """See a run of SLAM: the paths, the map, the landmarks.
 
     \b
     Example:
-      saga-fg view slam slam --save map.mcap
+      saga-fg view slam slam --save map.rrd
     """
     _show(result, save, list, result)
 
 
-def _show(result: Path, save: Path, make: Callable[[], Sequence[view.SceneView]], slam: Path | None = None) -> None:
-    """Write the scenes that `make` gives, with the map of a run of SLAM."""
-    view.check_view_file(save)
+def _show(
+    result: Path, save: Path | None, make: Callable[[], Sequence[view.SceneView]], slam: Path | None = None
+) -> None:
+    """Write or open the scenes that `make` gives, with the map of a run of SLAM."""
+    if save is None:
+        view.load_rerun()
+    else:
+        view.check_view_file(save)
     with working("making the view"):
         graphs = read_graphs(journal_of(result)) if journal_of(result).exists() else {}
         scenes = [replace(each, graphs=graphs.get(each.report.scene.name, ())) for each in make()]
@@ -114,5 +125,11 @@ def _show(result: Path, save: Path, make: Callable[[], Sequence[view.SceneView]]
             root = f"{roots[0]}/slam" if roots else "slam"
             origin = scenes[0].report.scene.world_T_ego[0, :3, 3] if scenes else None
             drawings.append(view.draw_slam(driven, root, origin))
-        view.write_view(save, view.in_order(*drawings))
-    typer.echo(f"{save}: {save.stat().st_size / 1e6:.1f} MB; open it in Foxglove")
+        roots = roots or ["slam"]
+        if save is None:
+            view.show_rerun(result.name, roots, view.in_order(*drawings))
+        else:
+            view.write_view(save, result.name, roots, view.in_order(*drawings))
+    if save is not None:
+        how = f"open it with: rerun {save}" if save.suffix == ".rrd" else "open it in Foxglove"
+        typer.echo(f"{save}: {save.stat().st_size / 1e6:.1f} MB; {how}")

@@ -1,6 +1,7 @@
 """Results in space: boxes, tracks, covariances, edges, points, landmarks.
 
-`ReportScene`s, scans, a SLAM result -> `Drawing`s -> a file for Foxglove (https://foxglove.dev)
+`ReportScene`s, scans, a SLAM result -> `Drawing`s -> a file for rerun (https://rerun.io) or Foxglove
+(https://foxglove.dev), or rerun's viewer, which opens
 """
 
 from pipelines.view.scenes import (
@@ -13,7 +14,7 @@ from pipelines.view.scenes import (
     read_slam_view,
     result_views,
 )
-from pipelines.view.writers import check_view_file, write_view
+from pipelines.view.writers import check_view_file, load_rerun, show_rerun, write_view
 
 __all__ = [
     "Drawing",
@@ -23,7 +24,9 @@ __all__ = [
     "draw_scene",
     "draw_slam",
     "in_order",
+    "load_rerun",
     "read_slam_view",
     "result_views",
+    "show_rerun",
     "write_view",
 ]

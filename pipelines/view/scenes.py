@@ -131,12 +131,14 @@ class Drawing:
     frame   frame of the shape's coordinates
     name    of the layer, below that of the frame; of a pose: of the frame that it places
     time    s from the start, None for a static shape
+    moment  row of the scene's moment, if it belongs to one
     """
 
     frame: str
     name: str
     shape: Shape
     time: float | None = None
+    moment: int | None = None
 
     @property
     def path(self) -> str:
@@ -214,17 +216,17 @@ def _drawn_moments(report: ReportScene, origin: FloatArray, start: float) -> Ite
     for k, time in enumerate((scene.timestamps - start).tolist()):
         pose = scene.world_T_ego[k].copy()
         pose[:3, 3] -= origin
-        yield Drawing(root, "ego", Pose(pose), time)
+        yield Drawing(root, "ego", Pose(pose), time, k)
         if scene.frames:
-            yield Drawing(root, "detections", _boxes(detections[k], origin, DETECTION), time)
+            yield Drawing(root, "detections", _boxes(detections[k], origin, DETECTION), time, k)
         if scene.ground_truth is not None:
             truth = scene.ground_truth[k]
             for name, rows, colour in (("seen", truth.visible, SEEN), ("hidden", ~truth.visible, HIDDEN)):
                 boxes = _boxes(truth.boxes.select(rows), origin, colour, {"id": truth.id[rows].tolist()})
-                yield Drawing(root, f"truth/{name}", boxes, time)
+                yield Drawing(root, f"truth/{name}", boxes, time, k)
         for name, method in methods.items():
             for layer, shape in method.at(k, next(edges[name])):
-                yield Drawing(root, f"{name}/{layer}", shape, time)
+                yield Drawing(root, f"{name}/{layer}", shape, time, k)
 
 
 def _scans(root: str, scans: ScanSequence, start: float, spacing: float) -> Iterator[Drawing]:
@@ -236,18 +238,21 @@ def _scans(root: str, scans: ScanSequence, start: float, spacing: float) -> Iter
 
 def _graphs(view: SceneView, origin: FloatArray, start: float) -> Iterator[Drawing]:
     """Draw the running graph of each frame. Raises `InputError` for records that are no graph."""
-    root = view.report.scene.name
+    root, moments = (
+        view.report.scene.name,
+        {round(t, 3): k for k, t in enumerate(view.report.scene.timestamps.tolist())},
+    )
     try:
         shapes = [_graph(graph, origin) for graph in view.graphs]
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise InputError(f"{root}: expected graphs as --explain writes them: {error!r:.80}") from error
     kinds = sorted({kind for _, lines in shapes for kind in lines})
     for graph, (marks, lines) in zip(view.graphs, shapes, strict=True):
-        time = float(graph["time"]) - start
-        yield Drawing(root, "graph/nodes", marks, time)
+        when = float(graph["time"]) - start, moments.get(round(graph["time"], 3))
+        yield Drawing(root, "graph/nodes", marks, *when)
         for number, kind in enumerate(kinds):
             shape = Lines(lines.get(kind, []), one_colour(colour_of(number)), np.array([0.05]))
-            yield Drawing(root, f"graph/{re.sub('[^A-Za-z0-9]+', '_', kind)}", shape, time)
+            yield Drawing(root, f"graph/{re.sub('[^A-Za-z0-9]+', '_', kind)}", shape, *when)
 
 
 def _graph(graph: Mapping[str, Any], origin: FloatArray) -> tuple[Points, dict[str, list[FloatArray]]]:

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from data_tools.datasets.nuscenes import nuscenes_scans
 from data_tools.lidar import Scan
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from data_tools.trajectories import Trajectory, write_tum_poses
+from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.report import ReportScene, scene_of_run
 from pipelines.tracking import track_scene
@@ -25,6 +27,77 @@ from saga_fg.tracking import Journal
 from tests.data_tools.kitti_example import write_sequence
 from tests.data_tools.nuscenes_example import VERSION, tables, write_tables
 from tests.pipelines.command import done, refused
+
+Rows = dict[str, dict[Any, Any]]
+"""Column -> time (None: always) -> value."""
+
+
+def read_rrd(path: Path) -> dict[str, Rows]:
+    """Entity -> its rows."""
+    reader = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed (extra [view])")
+    found: dict[str, Rows] = {}
+    for chunk in reader.RrdReader(path).stream().to_chunks():
+        batch = chunk.to_record_batch()
+        columns = {name: batch.column(name) for name in batch.schema.names}
+        time = columns.get("time")
+        for name, column in columns.items():
+            if name in chunk.timeline_names:
+                continue
+            rows = found.setdefault(chunk.entity_path, {}).setdefault(name, {})
+            for k in range(batch.num_rows):
+                if column[k].is_valid:
+                    rows[None if time is None else time[k].value / 1e9] = column[k].as_py()
+    return found
+
+
+def run(*arguments: object) -> Any:
+    return CliRunner().invoke(app, ["view", *map(str, arguments)])
+
+
+def test_sizes_labels_edges_and_the_graph_are_in_the_file(tmp_path):
+    """All places are those of the file for Foxglove, which is compared with the result below."""
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra [view])")
+    config = load_config("simulated")
+    scene = SimulatedTraffic(SimulatorSettings(duration=2.0, warm_up=5.0), scenes=1, seed=1).scene("scene-0001")
+    events: list[dict[str, Any]] = []
+    done = track_scene(scene, config.new_tracker("saga", Journal(config.tracker, events.append)))
+    shown = scene_of_run({"saga": done}, config.tracker.edges, config.sensors)
+    graphs = [event for event in events if event["event"] == "graph"]
+    write_view(tmp_path / "a.rrd", "a", ["scene-0001"], draw_scene(SceneView(shown, graphs=graphs)))
+    found = read_rrd(tmp_path / "a.rrd")
+    origin, k = scene.world_T_ego[0, :3, 3], 12
+    time = round(float(scene.timestamps[k] - scene.timestamps[0]), 9)
+    tracks = done.tracks[k]
+
+    def at(entity: str, column: str) -> Any:
+        times = {round(at, 9): value for at, value in found[f"/scene-0001/{entity}"][column].items()}
+        return times[time]
+
+    assert len(tracks) > 5
+    np.testing.assert_allclose(at("saga/boxes", "Boxes3D:half_sizes"), tracks.boxes.size / 2, atol=1e-3)
+    labels = at("saga/boxes", "Boxes3D:labels")
+    assert [label.split()[:2] for label in labels] == [
+        [str(id_), label] for id_, label in zip(tracks.id.tolist(), tracks.boxes.label.tolist(), strict=True)
+    ]
+    assert len(at("saga/ellipses", "Ellipsoids3D:half_sizes")) == len(tracks)
+    paths = at("saga/trajectories", "LineStrips3D:strips")
+    assert max(map(len, paths)) == k + 1
+    strips = np.array(at("saga/edges", "LineStrips3D:strips"))
+    assert strips.shape[1:] == (2, 3)  # from the place of one track to that of another
+    places = tracks.boxes.position - origin
+    assert (np.abs(strips[:, :, None] - places).max(axis=3).min(axis=2) < 1e-3).all()
+    graph = [each for each in graphs if abs(each["time"] - scene.timestamps[k]) < 1e-4][-1]
+    assert at("graph/nodes", "Points3D:labels") == [node["name"] for node in graph["nodes"]]
+    np.testing.assert_allclose(
+        np.array(at("graph/nodes", "Points3D:positions"))[:, :2],
+        np.array([node["position"] for node in graph["nodes"]]) - origin[:2],
+        atol=2e-3,
+    )
+    detections = [factor for factor in graph["factors"] if factor["kind"] == "detection"]
+    assert len(at("graph/detection", "LineStrips3D:strips")) == len(detections) > 0
+    assert len(at("graph/interaction", "LineStrips3D:strips")) == 2 * sum(
+        factor["kind"] == "interaction" for factor in graph["factors"]
+    )
 
 
 def test_the_ellipse_holds_ninety_percent():
@@ -52,21 +125,25 @@ def test_kitti_with_scans_and_a_map(tmp_path):
     write_tum_poses(slam / "trajectory.tum", Trajectory(np.array([0.0, 0.1]), poses))
     marks = [{"number": 2, "kind": "pole", "x": 3.0, "y": 4.0}, {"number": 3, "kind": "wall", "x": 0.0, "nx": 1.0}]
     (slam / "landmarks.json").write_text(json.dumps(marks))
-    file = tmp_path / "k.mcap"
-    done("view", "kitti", root / "result", "--dataroot", root, "--detections", root / "found", "--slam", slam,
-         "--save", file)  # fmt: skip
-    found = read_mcap(file)
-    (scan,) = found["/0007/ego/lidar/points"]
-    points = np.frombuffer(scan.content.data, "<f4").reshape(-1, 3)
+    file = tmp_path / "k.rrd"
+    result = run("kitti", root / "result", "--dataroot", root, "--detections", root / "found", "--slam", slam,
+                 "--save", file)  # fmt: skip
+    if "rerun-sdk" not in result.stderr and "pip install" in result.stderr:
+        pytest.skip("rerun-sdk is not installed (extra [view])")
+    assert result.exit_code == 0, result.output
+    found = read_rrd(file)
+    (points,) = found["/0007/ego/lidar/points"]["Points3D:positions"].values()
     np.testing.assert_allclose(points, [[5, 1, 0], [6, 2, 0]])  # thinned, in the sensor's frame
-    assert scan.time == 100_000_000
-    ((place,),) = (each.content.transforms for each in found["/0007/ego/lidar"])
-    np.testing.assert_allclose(xyz(place.translation), [1, 0, 2])
-    (track,) = (entity for each in found["/0007/tracks/boxes"] for entity in each.content.entities)
-    np.testing.assert_allclose(xyz(track.cubes[0].pose.position), [12, -2, 1], atol=1e-3)
-    ((names,),) = (each.content.entities for each in found["/0007/slam/names"])
-    assert [text.text for text in names.texts] == ["pole 2"]
-    np.testing.assert_allclose(xyz(names.spheres[0].pose.position), [3, 4, 0])
+    (place,) = found["/0007/ego/lidar"]["Transform3D:translation"].values()
+    np.testing.assert_allclose(place, [[1, 0, 2]])
+    assert list(found["/0007/ego/lidar/points"]["Points3D:positions"]) == [pytest.approx(0.1)]
+    (centre,) = (row for row in found["/0007/tracks/boxes"]["Boxes3D:centers"].values() if row)
+    np.testing.assert_allclose(centre, [[12, -2, 1]], atol=1e-3)
+    assert found["/0007/slam/names"]["Points3D:labels"] == {None: ["pole 2"]}
+    np.testing.assert_allclose(found["/0007/slam/names"]["Points3D:positions"][None], [[3, 4, 0]])
+    alone = tmp_path / "s.rrd"
+    assert run("slam", slam, "--save", alone).exit_code == 0
+    assert "/slam/trajectory" in read_rrd(alone)
 
 
 def test_scans_of_nuscenes_are_found_where_their_files_are(tmp_path):
@@ -101,16 +178,34 @@ def test_broken_slam_results_are_refused(tmp_path):
 
 
 def test_missing_extras_are_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert 'pip install "saga-fg[view]"' in refused("view", "file", tmp_path / "t.csv", "--save", tmp_path / "t.rrd")
     monkeypatch.setitem(sys.modules, "mcap_protobuf.writer", None)
     assert 'pip install "saga-fg[mcap]"' in refused("view", "file", "tracks.csv", "--save", tmp_path / "t.mcap")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_cannot_be_written_to_its_end_leaves_nothing(tmp_path, monkeypatch):
+    rerun = pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra [view])")
+
+    def full(stream: Any) -> None:
+        raise RuntimeError("File-writer thread shut down prematurely")
+
+    monkeypatch.setattr(rerun.RecordingStream, "flush", full)
+    with pytest.raises(InputError, match=r"a\.rrd: not written, is the disk full\? File-writer thread"):
+        write_view(tmp_path / "a.rrd", "a", ["world"], [])
     assert not list(tmp_path.iterdir())
 
 
 def test_what_a_view_may_not_be_written_to_is_refused(tmp_path):
     (tmp_path / "map.ply").write_text("points")
     said = refused("view", "slam", tmp_path, "--save", tmp_path / "map.ply")
-    assert "map.ply: expected a file name that ends in .mcap" in said
+    assert "map.ply: expected a file name that ends in .rrd (rerun) or .mcap (Foxglove)" in said
     assert (tmp_path / "map.ply").read_text() == "points"
+    with pytest.raises(InputError, match=r"a\.bag: expected a file name that ends in \.rrd \(rerun\) or \.mcap"):
+        write_view(tmp_path / "a.bag", "a", [], [])
+    said = refused("view", "file", "tracks.csv", "--save", tmp_path / "a.bag")
+    assert "expected a file name that ends in .rrd (rerun) or .mcap (Foxglove)" in said
 
 
 # Views for Foxglove: the content of the file, read back by mcap's own reader with the schemas in the file
@@ -173,7 +268,7 @@ def xyz(vector: Any) -> list[float]:
 def test_every_message_is_complete_and_times_ascend(tmp_path, shown):
     start = float(shown.scene.timestamps[0])
     view = SceneView(shown, TwoScans(np.array([start - 0.1, start + 0.6])))
-    write_view(tmp_path / "a.mcap", draw_scene(view))
+    write_view(tmp_path / "a.mcap", "a", ["scene-0001"], draw_scene(view))
     topics = read_mcap(tmp_path / "a.mcap")
     for topic, messages in topics.items():
         assert len({each.schema for each in messages}) == 1, topic
@@ -198,7 +293,7 @@ def test_every_message_is_complete_and_times_ascend(tmp_path, shown):
 
 def test_tracks_truth_and_ego_are_where_the_result_has_them(tmp_path, shown):
     scene, table = shown.scene, shown.tracks["saga"]
-    write_view(tmp_path / "a.mcap", draw_scene(SceneView(shown)))
+    write_view(tmp_path / "a.mcap", "a", ["scene-0001"], draw_scene(SceneView(shown)))
     topics = read_mcap(tmp_path / "a.mcap")
     boxes = topics[f"{ROOT}/saga/boxes"]
     assert [len(each.content.entities) for each in boxes] == np.bincount(table.frame, minlength=len(scene)).tolist()
@@ -254,28 +349,50 @@ def test_tracks_truth_and_ego_are_where_the_result_has_them(tmp_path, shown):
     np.testing.assert_allclose(xyz(transform.translation), scene.world_T_ego[k, :3, 3] - origin, atol=1e-3)
 
 
-def test_the_running_graph_is_drawn(tmp_path):
-    config, events = load_config("simulated"), list[dict[str, Any]]()
-    scene = SimulatedTraffic(SimulatorSettings(duration=1.0, warm_up=5.0), scenes=1, seed=1).scene("scene-0001")
-    tracked = track_scene(scene, config.new_tracker("saga", Journal(config.tracker, events.append)))
-    graphs = [event for event in events if event["event"] == "graph"]
-    view = SceneView(scene_of_run({"saga": tracked}, config.tracker.edges, config.sensors), graphs=graphs)
-    write_view(tmp_path / "a.mcap", draw_scene(view))
-    found, graph, origin = read_mcap(tmp_path / "a.mcap"), graphs[-1], scene.world_T_ego[0, :2, 3]
-    (nodes,) = found[f"{ROOT}/graph/nodes"][-1].content.entities
-    assert [text.text for text in nodes.texts] == [node["name"] for node in graph["nodes"]]
-    there = np.array([xyz(each.pose.position)[:2] for each in nodes.spheres])
-    np.testing.assert_allclose(there, np.array([node["position"] for node in graph["nodes"]]) - origin, atol=2e-3)
-    kinds = [factor["kind"] for factor in graph["factors"]]
-    for kind, lines in (("detection", 1), ("interaction", 2)):
-        (drawn,) = found[f"{ROOT}/graph/{kind}"][-1].content.entities
-        assert len(drawn.lines) == lines * kinds.count(kind) > 0
+PLACES = {"Boxes3D:centers", "Ellipsoids3D:centers", "Points3D:positions", "LineStrips3D:strips", "Arrows3D:origins"}
+
+
+def places(message: Any) -> list[list[float]]:
+    """Where a message of Foxglove has solids, points of lines, tails of arrows, points of a cloud, or a frame."""
+    if hasattr(message, "transforms"):
+        return [xyz(each.translation) for each in message.transforms]
+    if hasattr(message, "data"):
+        return np.frombuffer(message.data, dtype="<f4").reshape(-1, 3).tolist()
+    found = []
+    for entity in message.entities:
+        found += [xyz(each.pose.position) for each in (*entity.cubes, *entity.spheres, *entity.arrows)]
+        found += [xyz(point) for line in entity.lines for point in line.points]
+    return found
+
+
+def test_both_kinds_of_file_show_the_same(tmp_path, shown):
+    view = SceneView(shown, TwoScans(shown.scene.timestamps[0] + np.array([0.0, 0.6])))
+    found = {}
+    for suffix in ("rrd", "mcap"):
+        write_view(tmp_path / f"a.{suffix}", "a", ["scene-0001"], draw_scene(view))
+    for topic, messages in read_mcap(tmp_path / "a.mcap").items():
+        found[topic] = {round(each.time / 1e9, 6): places(each.content) for each in messages}
+    rows = {}
+    for entity, columns in read_rrd(tmp_path / "a.rrd").items():
+        for name in columns.keys() & {*PLACES, "Transform3D:translation"}:
+            rows[entity] = {
+                round(time or 0.0, 6): np.concatenate(
+                    [np.empty((0, 3)), *(np.reshape(each, (-1, 3)) for each in value)]
+                )
+                for time, value in columns[name].items()
+            }
+    assert rows.keys() == found.keys()
+    assert {f"{ROOT}/{name}" for name in ("ego", "saga/boxes", "saga/trajectories", "truth/seen")} < rows.keys()
+    for entity, at in rows.items():
+        assert at.keys() == found[entity].keys(), entity
+        for time, there in at.items():
+            np.testing.assert_allclose(np.reshape(found[entity][time], (-1, 3)), there, atol=2e-3, err_msg=entity)
 
 
 def test_scans_are_clouds_in_the_frame_of_their_sensor(tmp_path, shown):
     start = float(shown.scene.timestamps[0])
     scans = TwoScans(np.array([start - 0.1, start + 0.6]))
-    write_view(tmp_path / "a.mcap", draw_scene(SceneView(shown, scans)))
+    write_view(tmp_path / "a.mcap", "a", ["scene-0001"], draw_scene(SceneView(shown, scans)))
     topics = read_mcap(tmp_path / "a.mcap")
     first, second = topics[f"{ROOT}/ego/lidar/points"]
     assert (first.time, second.time) == (0, 700_000_000)  # of what is earliest
@@ -294,7 +411,7 @@ def test_scans_are_clouds_in_the_frame_of_their_sensor(tmp_path, shown):
     np.testing.assert_allclose([*xyz(pose.rotation), pose.rotation.w], [0, 0, np.sin(0.25), np.cos(0.25)])
 
 
-def test_a_run_of_slam_is_drawn_alone(tmp_path):
+def test_the_command_writes_the_file_that_the_suffix_names(tmp_path):
     pytest.importorskip("mcap_protobuf", reason="mcap is not installed (extra [mcap])")
     slam = tmp_path / "slam"
     slam.mkdir()
@@ -319,7 +436,7 @@ def test_a_drawing_that_fails_leaves_no_file(tmp_path, shown):
         raise InputError("scan 7: broken")
 
     with pytest.raises(InputError, match="scan 7"):
-        write_view(tmp_path / "a.mcap", broken())
+        write_view(tmp_path / "a.mcap", "a", ["scene-0001"], broken())
     assert not list(tmp_path.iterdir())
 
 
