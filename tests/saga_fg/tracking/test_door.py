@@ -37,14 +37,6 @@ def test_noise_without_which_no_measurement_can_be_taken_in(subtests):
                 NoiseModel(**{name: value})
 
 
-def test_covariances_of_detections_are_positive_definite(subtests):
-    for bad in [np.zeros((2, 2)), -np.eye(2), [[1.0, 2.0], [2.0, 1.0]], [[1.0, 0.5], [0.0, 1.0]]]:
-        with subtests.test(bad=bad):
-            boxes = Boxes.of(["car"], np.zeros((1, 3)))
-            with pytest.raises(InputError):
-                Detections(boxes, np.array([0.9]), position_covariance=np.array(bad)[None])
-
-
 def test_boxes_that_cannot_be(subtests):
     for column, value in [("position", np.nan), ("position", 1e300), ("size", -1.0), ("size", 0.0)]:
         with subtests.test(column=column, value=value):

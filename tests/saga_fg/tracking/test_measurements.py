@@ -124,6 +124,7 @@ def test_a_new_track_is_as_uncertain_as_its_detection(estimator):
 def test_wrong_covariances_are_refused(subtests):
     for covariance, message in [
         (-ALONG, "position_covariance.0.: expected a positive definite"),
+        (0 * ALONG, "position_covariance.0.: expected a positive definite"),
         (np.array([[[1.0, 0.5], [0.0, 1.0]]]), "position_covariance.0.: expected a symmetric"),
         (np.ones((2, 2)), "position_covariance: expected shape"),
         (np.array([[[1.0, np.nan], [np.nan, 1.0]]]), "position_covariance.0, 0, 1.: expected a finite number"),

@@ -82,16 +82,10 @@ def test_noise_that_comes_with_the_detections_stays_as_it_is():
     for frame, _ in frames(1.0, position_covariance=given):
         a, b = with_scale.step(frame), without.step(frame)
         np.testing.assert_array_equal(a.position_covariance, b.position_covariance)
+    assert with_scale.noise_scales == {}
 
 
 def test_models_are_scaled_in_positions_alone():
     scaled = scaled_sensors({}, {"table": 2.0})["table"].noise["default"]
     usual = Sensor().noise["default"]
     assert (scaled.position, scaled.velocity, scaled.yaw) == (2 * usual.position, usual.velocity, usual.yaw)
-
-
-def test_nothing_is_told_where_detections_bring_their_covariances():
-    tracker = Tracker(sensors=TABLE)
-    for frame, _ in frames(0.1, position_covariance=np.tile(0.01 * np.eye(2), (6, 1, 1))):
-        tracker.step(frame)
-    assert tracker.noise_scales == {}

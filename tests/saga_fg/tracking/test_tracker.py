@@ -16,7 +16,6 @@ from saga_fg import (
 from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel
 from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings
-from saga_fg.tracking.tracker_state import LIFETIME
 from tests.saga_fg.traffic_frames import (
     NAN,
     SIZE,
@@ -163,18 +162,6 @@ def test_doubtful_tracks_end_by_misses_where_the_sensor_looks_and_not_elsewhere(
         tracker.step(frame(0.0, [position], score=0.3, **pose))
         left.append(len(run(tracker, [frame(t, [], "camera", **pose) for t in (0.1, 0.2, 0.3)])[-1]))
     assert left == [0, 1]
-
-
-def test_how_often_nobody_looks_does_not_matter_to_belief():
-    """Existence out of view falls with time, not with the number of frames."""
-    sensors = {"blind": Sensor(detection_probability=0.0)}
-    scores = []
-    for count in (1, 20):
-        tracker = Tracker(settings(max_deviation=20.0), sensors)
-        tracker.step(frame(0.0, [(0, 0)], score=0.5))
-        scores.append(run(tracker, [frame(t, [], "blind") for t in np.linspace(0, 1, count + 1)[1:]])[-1].score[0])
-    assert scores[0] == pytest.approx(0.5 * 0.5 * np.exp(-1.0 / LIFETIME))
-    assert scores[1] == pytest.approx(scores[0])
 
 
 def test_belief_reports_tracks_and_keeps_them_alive():
