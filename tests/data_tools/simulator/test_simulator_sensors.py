@@ -18,7 +18,7 @@ from data_tools.simulator.sensed_world import (
     range_drifts,
     sensor_position,
 )
-from data_tools.simulator.settings import SensorSettings, camera, lidar, radar
+from data_tools.simulator.settings import SensorSettings, camera, far_camera, lidar, radar, sparse_lidar
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.boxes import Boxes
@@ -247,3 +247,12 @@ def test_neighbours_are_those_of_a_plain_search(data):
         rear = [j for j in there if s[j] < s[i]]
         assert ahead[i] == (min(front, key=lambda j: s[j]) if front else -1)
         assert behind[i] == (max(rear, key=lambda j: s[j]) if rear else -1)
+
+
+def test_a_camera_sees_a_person_where_a_lidar_has_too_few_points():
+    boxes = Boxes.of(
+        ["pedestrian", "truck"], [[55.0, 0.0, 0.9], [55.0, 0.0, 1.8]], [[0.65, 0.65, 1.72], [8.0, 2.5, 3.4]], [0.0, 0.0]
+    )
+    person, truck = detection_probability(sparse_lidar(), np.zeros(3), boxes, np.ones(2))
+    assert person < 0.25 < 0.9 < truck
+    assert detection_probability(far_camera(), np.zeros(3), boxes, np.ones(2))[0] > 0.7
