@@ -53,7 +53,7 @@ def configuration_tables() -> str:
         "Limits of the service (`saga-fg serve --limits`)": StreamSettings,
         "The simulator (`saga-fg simulate`)": SimulatorSettings,
     }
-    for name in ("Odometry", "Gps", "Imu", "Wheels", "Landmarks"):
+    for name in ("Odometry", "Gps", "Imu", "Wheels", "Landmarks", "LaneKeeping"):
         classes[f"Factor provider `saga_fg.providers:{name}`"] = getattr(providers, name)
     documented: dict[tuple[type, str], str] = {}
     return "\n".join(f"## {title}\n\n{settings_reference(cls, documented)}" for title, cls in classes.items())

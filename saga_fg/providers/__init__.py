@@ -1,4 +1,4 @@
-"""Factor providers: odometry, satellite fixes, inertial sensors, wheels, landmarks, objects seen from the vehicle.
+"""Factor providers: odometry, satellite fixes, inertial sensors, wheels, landmarks, lanes, objects seen from the vehicle.
 
 Each reads what a frame brings (`Frame.ego`) and works in the running graph wherever that is: an
 `IncrementalSmoother` in Python, the tracker, and by name in a configuration with its fields as settings,
@@ -8,12 +8,13 @@ Each reads what a frame brings (`Frame.ego`) and works in the running graph wher
 
 from saga_fg.providers.navigation import Gps, Imu
 from saga_fg.providers.odometry import Odometry, StartSettings, Wheels
-from saga_fg.providers.surroundings import Landmarks, RelativeDetections
+from saga_fg.providers.surroundings import Landmarks, LaneKeeping, RelativeDetections
 
 __all__ = [
     "Gps",
     "Imu",
     "Landmarks",
+    "LaneKeeping",
     "Odometry",
     "RelativeDetections",
     "StartSettings",

@@ -7,20 +7,24 @@ import gtsam
 import numpy as np
 import pytest
 
-from saga_fg import Detections, Frame, InputError
+from saga_fg import ConstantVelocity, Detection, Detections, Frame, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.estimators import BatchSolver, IncrementalSmoother
 from saga_fg.graph import (
     EGO_BIAS,
     EGO_POSE,
     EGO_VELOCITY,
     LANDMARK,
+    MAP_NODE,
     GraphError,
 )
 from saga_fg.model.landmarks import PointLandmark
-from saga_fg.providers import Gps, Imu, Landmarks, Odometry, StartSettings
+from saga_fg.model.sensor import NoiseModel
+from saga_fg.providers import Gps, Imu, Landmarks, LaneKeeping, Odometry, StartSettings
 from saga_fg.providers.navigation import GRAVITY
+from saga_fg.tracking import ClassSettings
 from saga_fg.types.frame import EgoMeasurements, GpsFix, ImuSamples, OdometryIncrement
 from saga_fg.types.landmark import Observation
+from saga_fg.types.road_map import Lane
 
 DT = 0.1
 START = (5.0, -3.0, 0.4)
@@ -251,3 +255,33 @@ def test_what_does_not_fit_is_one_error_and_the_smoother_goes_on(subtests):
             if ego.imu is None:
                 smoother.step(DT, frame=frame(1, replace(ego, odometry=None, gps=None, landmarks={})))
                 assert smoother.time == DT
+
+
+def test_vehicles_keep_to_a_lane_that_the_map_has_too_far_left():
+    """The map is off by 0.6 m: three cars that are seen well tell so, and a fourth, seen badly, is held to the lane."""
+    lane = Lane("main", ((100.0, 50.6), (400.0, 50.6)), 4.0)
+    settings = TrackerSettings(estimator="isam2", edges=(), classes={"default": ClassSettings(motion=STEADY)})
+    sensors = {"sharp": Sensor(noise={"default": NoiseModel(position=0.1)})}
+    sensors["dull"] = Sensor(noise={"default": NoiseModel(position=2.0)}, use_velocity=False)
+    off = {}
+    for providers in ((), (LaneKeeping((lane,), deviation=0.3, map_deviation=1.0),)):
+        rng = np.random.default_rng(2)
+        tracker = Tracker(settings, sensors, providers=providers)
+        for k in range(60):
+            cars = np.stack([110 + 0.8 * k + 30 * np.arange(4.0), np.full(4, 50.0)], axis=1)
+            tracker.step(seen_at(0.1 * k, "sharp", cars[:3] + rng.normal(0, 0.1, (3, 2))))
+            tracks = tracker.step(seen_at(0.1 * k, "dull", cars[3:] + rng.normal(0, 1.0, (1, 2))))
+        off[len(providers)] = np.abs(tracks.boxes.position[:, 1] - 50.0)
+    assert off[1][3] < 0.5 * off[0][3]
+    assert off[1][:3].max() < 0.15
+    graph = tracker.snapshot().joint[0].graph
+    (line,) = graph.of(MAP_NODE, None).values()
+    assert str(line) == "lane main 0"
+    assert graph.state(line.key) == pytest.approx([-0.6], abs=0.15)
+
+
+STEADY = ConstantVelocity(acceleration_noise=0.2)
+
+
+def seen_at(time: float, sensor: str, places: np.ndarray) -> Frame:
+    return Frame(time, sensor, Detections.of([Detection("car", (x, y, 0.8), score=0.9) for x, y in places]))
