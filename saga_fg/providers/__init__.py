@@ -1,4 +1,4 @@
-"""Factor providers: odometry, satellite fixes, inertial sensors, wheels, landmarks, lanes, objects seen from the vehicle.
+"""Factor providers: odometry, satellite fixes, inertial sensors, wheels, landmarks, lanes, relative objects.
 
 Each reads what a frame brings (`Frame.ego`) and works in the running graph wherever that is: an
 `IncrementalSmoother` in Python, the tracker, and by name in a configuration with its fields as settings,
