@@ -26,8 +26,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from data_tools.datasets.mcap.objects import header
-from data_tools.datasets.mcap.recording import definition
+from data_tools.datasets.mcap.ros2_types import definition, header
 from data_tools.files.atomic_files import write_text
 from data_tools.laser import LaserLog
 from data_tools.lidar import Scan, constant_velocity

@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_tools.datasets.kitti.dataset import world_position
-from data_tools.datasets.mcap.dataset import TRANSFORM_TYPES, TransformRecord, TransformTree, transform_records
-from data_tools.datasets.mcap.objects import checked_time, frame_name, nanoseconds, xyz
 from data_tools.datasets.mcap.recording import SUFFIXES, LoggedMessage, Recording, Topic, decoded_messages
+from data_tools.datasets.mcap.ros2_types import checked_time, frame_name, nanoseconds, xyz
+from data_tools.datasets.mcap.transforms import TRANSFORM_TYPES, TransformRecord, TransformTree, transform_records
 from data_tools.files.isolated_reading import isolated
 from data_tools.laser.carmen import LaserLog, padded
 from data_tools.lidar.recording import RecordingOptions, ScanRecording

@@ -29,6 +29,7 @@ COMMANDS = {
     "simulate": ("start:simulate", "Simulate traffic, and write it as recordings."),
     "demo": ("start:demo", "Simulate traffic, track it with three methods, compare them."),
     "serve": ("serve:serve", "Track live: detections in, tracks out, as lines of JSON."),
+    "serve ros2": ("serve:serve_ros2", "Track live over DDS, as a node of ROS 2 does."),
     "status": ("serve:status", "Ask a running service for its counts and latencies."),
     "config": ("start:config", "Print settings, their defaults and what they mean, as YAML."),
     "docs": ("commands:docs", "Say where a page of the documentation is."),
@@ -49,6 +50,10 @@ class LazyGroup(ReportingGroup):
         module, _, name = COMMANDS[cmd_name][0].partition(":")
         found = getattr(import_module(f"pipelines.cli.{module}"), name)
         return typer.main.get_command(found) if isinstance(found, typer.Typer) else new_command(found, cmd_name)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name = " ".join(args[:2])
+        return (name, self.get_command(ctx, name), args[2:]) if name in COMMANDS else super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         with formatter.section("Commands"):

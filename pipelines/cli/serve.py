@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -14,6 +15,9 @@ from typing import Annotated, Any
 
 import typer
 
+from data_tools.datasets.mcap.dataset import RecordingOptions
+from data_tools.datasets.mcap.source import sensor_topics
+from data_tools.datasets.mcap.transforms import DEFAULT_EGO, WORLD
 from pipelines.checks import Checks
 from pipelines.cli import options as how
 from pipelines.cli.options import Config, Verbose
@@ -22,7 +26,6 @@ from pipelines.config import Method, TrackConfig, load_config
 from pipelines.configuration import load_settings, write_settings
 from pipelines.explaining import clock_text
 from pipelines.serving import (
-    Address,
     SocketServer,
     StateKeeper,
     StopRequest,
@@ -36,13 +39,14 @@ from pipelines.serving.settings import LogLimitFilter
 from pipelines.tracking import one_thread, return_large_blocks
 from saga_fg.errors import InputError
 from saga_fg.kernels.compilation import load_kernels
+from saga_fg.tables.column_names import pairs
 
 DEFAULT_ADDRESS = "127.0.0.1:7447"
 
 
 @dataclass(frozen=True)
-class ServiceOptions:
-    """Where a service listens, what it keeps, and within which limits."""
+class ListenOptions:
+    """Where a service listens."""
 
     listen: Annotated[
         str | None,
@@ -55,6 +59,12 @@ class ServiceOptions:
     allow_remote: Annotated[
         bool, typer.Option("--allow-remote", help="Listen where other machines can connect. There is no password.")
     ] = False
+
+
+@dataclass(frozen=True)
+class ServiceOptions:
+    """What a service keeps, within which limits, and what it learns."""
+
     reorder: Annotated[
         float | None,
         typer.Option(
@@ -72,23 +82,25 @@ class ServiceOptions:
             "--limits", help="YAML file of limits and times to wait; see `saga-fg config --limits`.", metavar="FILE"
         ),
     ] = None
+    learn_offsets: how.LearnOffsetsOption = None
 
 
 def _serve_stream(
+    listening: ListenOptions,
     service: ServiceOptions,
     tracker: how.TrackerOptions,
     predict: Annotated[
         str | None,
         typer.Option("--predict", help="Answer every frame with its tracks these s later, as well.", metavar="S,S,..."),
     ] = None,
-    learn_offsets: how.LearnOffsetsOption = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
     """Track live: detections in, tracks out, as newline-delimited JSON.
 
     One line is one frame of one sensor; every frame is answered with the tracks at its time. A line that cannot be
-    used is answered with what is wrong, counted and skipped. `saga-fg docs guides/stream` has the messages.
+    used is answered with what is wrong, counted and skipped. `saga-fg docs guides/stream` has the messages. `saga-fg
+    serve ros2` does the same over DDS.
 
     SIGTERM and Ctrl-C finish what has come in, with a bound on the time; the exit code is then 143 or 0.
 
@@ -100,34 +112,140 @@ def _serve_stream(
       saga-fg serve --listen ./saga.sock --snapshot state.saga --every 2
       saga-fg status
     """
+
+    def run(stream: StreamTracker[Any], ready: Ready, stop: StopRequest) -> None:
+        if listening.listen is None:
+            try:
+                ready()
+                serve_pipe(stream, sys.stdin.buffer, sys.stdout.buffer, stop)
+            except BrokenPipeError:
+                typer.echo("the reader of the tracks has gone away", err=True)
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is buffered has nowhere to go
+            return
+        address = parse_address(listening.listen)
+        if not address.is_local and not listening.allow_remote:
+            raise InputError(
+                f"--listen {listening.listen}: other machines could connect there; --allow-remote if that is meant"
+            )
+        SocketServer(stream, address, lambda at: ready(f"listening at {at}")).run(stop)
+
+    _run(service, tracker, config, verbose, run, horizons=how.horizons(predict, tracker.method))
+
+
+serve = how.as_command(_serve_stream)
+
+
+def _serve_ros2(
+    detections: Annotated[
+        list[str],
+        typer.Option(
+            "--detections",
+            help="Topic of vision_msgs/Detection3DArray or Autoware's DetectedObjects or TrackedObjects, a sensor of "
+            "its own; repeatable.",
+            metavar="[SENSOR=]TOPIC",
+        ),
+    ],
+    tracks: Annotated[
+        list[str],
+        typer.Option(
+            "--tracks",
+            help="Topic to publish; TYPE: TrackedObjects, Detection3DArray or MarkerArray, by the detections if left "
+            "out; repeatable.",
+            metavar="[TYPE=]TOPIC",
+        ),
+    ],
+    service: ServiceOptions,
+    tracker: how.TrackerOptions,
+    classes: Annotated[
+        str | None,
+        typer.Option(
+            "--classes", help="Names of classes: CAR=car. `SIGN=` leaves a class out.", metavar="THEIRS=OURS,..."
+        ),
+    ] = None,
+    world: Annotated[str, typer.Option("--world", help="Frame to track in.", metavar="FRAME")] = WORLD,
+    ego: Annotated[str, typer.Option("--ego", help="Frame of the vehicle.", metavar="FRAME")] = DEFAULT_EGO,
+    odometry: Annotated[
+        str | None,
+        typer.Option(
+            "--odometry", help="Topic of nav_msgs/Odometry for the pose, beside /tf and /tf_static.", metavar="TOPIC"
+        ),
+    ] = None,
+    config: Config = None,
+    verbose: Verbose = False,
+) -> None:
+    """Track live as a node of ROS 2, over DDS: topics of detections in, tracks out. Needs [ros2], no ROS.
+
+    The domain is that of ROS_DOMAIN_ID, network interfaces are those of CYCLONEDDS_URI. Types and quality of service
+    of the detections are those of their publishers. `saga-fg docs guides/ros2` has an example.
+
+    SIGTERM and Ctrl-C finish what has come in; the exit code is then 143 or 0.
+
+    \b
+    Examples:
+      saga-fg serve ros2 --detections /perception/objects --tracks /tracks
+      saga-fg serve ros2 --detections lidar=/lidar/objects --detections radar=/radar/objects --tracks /tracks
+      saga-fg serve ros2 --detections /objects --tracks TrackedObjects=/tracks --tracks MarkerArray=/markers
+      saga-fg serve ros2 --detections /roadside --world mast --tracks /tracks --snapshot state.saga
+    """
+    from pipelines.serving.ros2 import Ros2Node, result_topics, shown_tracks
+
+    topics = sensor_topics("--detections", detections)
+    options = RecordingOptions(topics, pairs("--classes", classes), world, ego, odometry)
+    results = result_topics(tracks)
+
+    def run(stream: StreamTracker[Any], ready: Ready, stop: StopRequest) -> None:
+        node = Ros2Node(stream, options, results)
+        ready(node.about)
+        node.run(stop)
+
+    _run(service, tracker, config, verbose, run, shown=shown_tracks)
+
+
+serve_ros2 = how.as_command(_serve_ros2)
+Ready = Callable[..., None]
+
+
+def _run(
+    service: ServiceOptions,
+    tracker: how.TrackerOptions,
+    config: Path | None,
+    verbose: bool,
+    run: Callable[[StreamTracker[Any], Ready, StopRequest], None],
+    **answers: Any,
+) -> None:
+    """Run a service until its source ends or it is told to stop; answers: how the stream answers."""
     if not verbose:
         for handler in logging.getLogger().handlers:
             handler.addFilter(LogLimitFilter())
     method = tracker.method
-    how.check_learn_offsets(learn_offsets, method)
+    how.check_learn_offsets(service.learn_offsets, method)
     settings = tracker.configured("file", config)
     bounds = StreamSettings() if service.limits is None else load_settings(StreamSettings, service.limits)
     if service.reorder is not None:
         bounds = replace(bounds, reorder=service.reorder)
     checks = Checks(settings.of_method(method), load_config("file"))
-    horizons = how.horizons(predict, method)
-    stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), bounds, checks, horizons)
+    stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), bounds, checks, **answers)
     return_large_blocks()
     kept = service.snapshot
     keeper = None if kept is None else _restored(stream, kept, service.every, settings, method)
+
+    def ready(line: str = "") -> None:
+        load_kernels()
+        if keeper is not None:
+            keeper.start()
+        if line:
+            typer.echo(line, err=True)
+
     last_acts = () if keeper is None else (keeper.save, keeper.clear_leftovers)
     with one_thread(), StopRequest(bounds.stop_timeout, *last_acts) as stop:
-        _serve(stream, keeper, service.listen, service.allow_remote, stop)
+        run(stream, ready, stop)
         if keeper is not None:
             keeper.stop()
         typer.echo(_summary(stream.status()), err=True)
-        if learn_offsets is not None:
-            how.write_offsets(learn_offsets, [stream.clocks()], settings, "a stream")
+        if service.learn_offsets is not None:
+            how.write_offsets(service.learn_offsets, [stream.clocks()], settings, "a stream")
     if stop.number == signal.SIGTERM:
         raise typer.Exit(TERMINATED)
-
-
-serve = how.as_command(_serve_stream)
 
 
 def _restored(
@@ -147,32 +265,6 @@ def _restored(
     if keeper.restore():
         typer.echo(f"going on from {snapshot}: {stream.status()['frames']} frames so far", err=True)
     return keeper
-
-
-def _serve(
-    stream: StreamTracker[Any], keeper: StateKeeper | None, listen: str | None, allow_remote: bool, stop: StopRequest
-) -> None:
-    """Until the source ends or the service is told to stop."""
-
-    def ready(address: Address | None = None) -> None:
-        load_kernels()
-        if keeper is not None:
-            keeper.start()
-        if address is not None:
-            typer.echo(f"listening at {address}", err=True)
-
-    if listen is None:
-        try:
-            ready()
-            serve_pipe(stream, sys.stdin.buffer, sys.stdout.buffer, stop)
-        except BrokenPipeError:
-            typer.echo("the reader of the tracks has gone away", err=True)
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is buffered has nowhere to go
-    else:
-        address = parse_address(listen)
-        if not address.is_local and not allow_remote:
-            raise InputError(f"--listen {listen}: other machines could connect there; --allow-remote if that is meant")
-        SocketServer(stream, address, ready).run(stop)
 
 
 def status(

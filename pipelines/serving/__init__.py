@@ -3,7 +3,7 @@
     line -> message -> numbering -> reordering -> tracker -> answer
 
 `StreamTracker` answers lines; `serve_pipe` takes them from standard input, `SocketServer` from a TCP or Unix socket;
-`StateKeeper` keeps the state in a file.
+`StateKeeper` keeps the state in a file. `ros2.Ros2Node` gives frames of ROS 2's messages to the same stream.
 """
 
 from pipelines.serving.client import StreamClient

@@ -29,6 +29,7 @@ from pipelines.tracking import OnlineTracker, compared_clocks, resident_memory
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking import GreedyTracker, SensorTime
+from saga_fg.types.track import Tracks
 
 log = logging.getLogger(__name__)
 
@@ -70,6 +71,7 @@ class StreamTracker(Generic[Client]):
     settings     limits of the stream
     checks       warns of what is doubtful in the first frames, None: nothing is said
     horizons     (H,) s, to which every answer to a frame has predictions; None for none
+    shown        makes the answer of the tracks at a frame
     keeper       keeps the state in a file, None: nothing is kept
 
     A line that cannot be used is answered, counted and otherwise without effect; so is one that makes the tracker fail.
@@ -83,6 +85,7 @@ class StreamTracker(Generic[Client]):
         settings: StreamSettings | None = None,
         checks: Checks | None = None,
         horizons: FloatArray | None = None,
+        shown: Callable[[Tracks], Answer] = tracks_message,
     ) -> None:
         self.settings = settings or StreamSettings()
         self.counts: Counter[str] = Counter()
@@ -98,15 +101,19 @@ class StreamTracker(Generic[Client]):
         self._log_limit = LogLimit()
         self._checks = checks
         self._horizons = horizons
+        self._shown = shown
         self._started = time.monotonic()
         self._lock = threading.Lock()
 
-    def handle(self, line: bytes | None, client: Client, received: float | None = None) -> list[tuple[Client, Answer]]:
+    def handle(
+        self, line: bytes | FrameMessage | None, client: Client, received: float | None = None
+    ) -> list[tuple[Client, Answer]]:
         """Return the answers to one line of a client, and to held frames whose turn has come with it.
 
-        line: None for one that was too long; received: time of reading, by `time.monotonic()`
+        line: None for one that was too long, a frame where it was read elsewhere; received: time of reading, by
+        `time.monotonic()`
         """
-        if line is not None and not line.strip():
+        if isinstance(line, bytes) and not line.strip():
             return []
         with self._lock:
             self.counts["messages"] += 1
@@ -119,6 +126,12 @@ class StreamTracker(Generic[Client]):
         if self.keeper is not None and answers and answers[-1][1]["type"] == "reset":
             answers[-1][1]["durable"] = self.keeper.save()  # frames can be sent again, a reset could not
         return answers
+
+    def refuse(self, error: InputError) -> Answer:
+        """Count a message that could not be read elsewhere; return the answer."""
+        with self._lock:
+            self.counts["messages"] += 1
+            return self._refused(error)
 
     def flush(self) -> list[tuple[Client, Answer]]:
         """Take in all frames that are held back, at the end of a stream; return their answers."""
@@ -175,10 +188,12 @@ class StreamTracker(Generic[Client]):
         """Note that a state with these numbers is on the disk, for the answers from now on."""
         self._durable = durable
 
-    def _handle(self, line: bytes | None, client: Client, received: float) -> list[tuple[Client, Answer]]:
+    def _handle(
+        self, line: bytes | FrameMessage | None, client: Client, received: float
+    ) -> list[tuple[Client, Answer]]:
         if line is None:
             raise InputError(f"message: expected at most {self.settings.max_message} bytes")
-        message = parse_message(line, self.settings)
+        message = line if isinstance(line, FrameMessage) else parse_message(line, self.settings)
         if isinstance(message, FrameMessage):
             return self._take(_Held(message, client, received))
         if message.kind == "status":
@@ -269,7 +284,7 @@ class StreamTracker(Generic[Client]):
             self._held.set_clock(frame.timestamp)
             clock = {"clock": verdict}
         predicted = {} if self._horizons is None else {"predictions": self._predictions(self._horizons)}
-        return tracks_message(tracks) | predicted | clock | self._about(message)
+        return self._shown(tracks) | predicted | clock | self._about(message)
 
     def _predictions(self, horizons: FloatArray) -> Answer:
         """Return the tracks at times after the newest frame, s. Raises `InputError` where there are none."""

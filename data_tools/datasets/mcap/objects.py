@@ -9,6 +9,8 @@ https://github.com/autowarefoundation/autoware_msgs; Autoware documentation, "Ob
 of the same type; `id` is that of the track. There is no place for a velocity. Source:
 https://github.com/ros-perception/vision_msgs, version 4 (Humble and later).
 
+`visualization_msgs/MarkerArray`, of results alone: a box and a text for each track, for RViz.
+
 Foxglove's `SceneUpdate`: an entity is an object if it has a cube, a cylinder or a sphere, of which the first counts.
 Class and score are taken from the metadata (the first of `class`, `label`, `category`, `type`; of `score`,
 `confidence`, `probability`), the class else from the first text, the velocity from `vx` and `vy`. Every message shows
@@ -23,17 +25,18 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from data_tools.datasets.mcap.ros2_types import Columns, Message, frame_name, header, nanoseconds, wxyz, xyz
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, StrArray, upper_triangle
-from saga_fg.numerics.geometry import checked_quaternions, quaternion_norms, quaternion_rotation, yaw_of, yaw_quaternion
+from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, upper_triangle
+from saga_fg.numerics.geometry import quaternion_norms, quaternion_rotation, yaw_of, yaw_quaternion
 from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE, MAX_SPEED, Boxes
 from saga_fg.types.frame import Detections
 from saga_fg.types.track import Tracks
 
 NAN = float("nan")
 NO_COVARIANCE = (NAN,) * 36
-Message = dict[str, Any]
 
 
 class ObjectRow(NamedTuple):
@@ -164,66 +167,23 @@ def _covariances(rows: ObjectRows, name: str) -> FloatArray:
     return P
 
 
-def transform_matrix(transform: Any) -> FloatArray:
-    """The matrix (4, 4) of a geometry_msgs/Transform. Raises `InputError` for an invalid rotation."""
-    T = np.eye(4)
-    T[:3, :3] = quaternion_rotation(checked_quaternions("rotation", [wxyz(transform.rotation)]))[0]
-    T[:3, 3] = xyz(transform.translation)
-    return T
-
-
-def nanoseconds(stamp: Any) -> int:
-    """ns of a ROS time (sec, nanosec) or a protobuf timestamp (seconds, nanos)."""
-    if hasattr(stamp, "seconds"):
-        return checked_time(int(stamp.seconds) * 10**9 + int(stamp.nanos))
-    return checked_time(int(stamp.sec) * 10**9 + int(stamp.nanosec))
-
-
-def checked_time(time: int) -> int:
-    """A time, ns, that 64 bits hold. Raises `InputError` for another."""
-    if not -(2**63) <= time < 2**63:
-        raise InputError(f"time: expected nanoseconds within 64 bits, got {time}")
-    return time
-
-
-def frame_name(name: str) -> str:
-    """Name of a frame without the leading slash of old."""
-    return name.lstrip("/")
-
-
-def xyz(vector: Any) -> tuple[float, float, float]:
-    """Components of a vector."""
-    return (vector.x, vector.y, vector.z)
-
-
-def wxyz(quaternion: Any) -> tuple[float, float, float, float]:
-    """Components of a quaternion, the scalar first."""
-    return (quaternion.w, quaternion.x, quaternion.y, quaternion.z)
-
-
-def header(stamp: int, frame: str) -> Message:
-    """A std_msgs/Header; stamp in ns."""
-    seconds, nanoseconds = divmod(stamp, 10**9)
-    return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame}
-
-
 def vector(values: FloatArray) -> Message:
-    """A vector or point (3,); unknown entries are 0."""
-    x, y, z = np.nan_to_num(values).tolist()
+    """Vectors or points (..., 3); unknown entries are 0."""
+    x, y, z = np.moveaxis(np.nan_to_num(values), -1, 0)
     return {"x": x, "y": y, "z": z}
 
 
-def pose(position: FloatArray, yaw: float) -> Message:
-    """A geometry_msgs/Pose; an unknown yaw is 0."""
-    w, x, y, z = yaw_quaternion(float(np.nan_to_num(yaw))).tolist()
+def pose(position: FloatArray, yaw: FloatArray | float) -> Message:
+    """geometry_msgs/Poses of positions (..., 3) and headings (...); an unknown one is 0."""
+    w, x, y, z = np.moveaxis(yaw_quaternion(np.nan_to_num(yaw)), -1, 0)
     return {"position": vector(position), "orientation": {"x": x, "y": y, "z": z, "w": w}}
 
 
-def covariance(P: FloatArray) -> list[float]:
-    """36 entries of a 6 x 6 covariance with a horizontal part (2, 2) alone; unknown is 0."""
-    whole = np.zeros((6, 6))
-    whole[:2, :2] = np.nan_to_num(P)
-    return whole.ravel().tolist()
+def covariance(P: FloatArray) -> FloatArray:
+    """The entries (N, 6, 6) of covariances with a horizontal part (N, 2, 2) alone; unknown is 0."""
+    whole = np.zeros((len(P), 6, 6))
+    whole[:, :2, :2] = np.nan_to_num(P)
+    return whole
 
 
 AUTOWARE_CLASSES = (
@@ -281,37 +241,35 @@ def autoware_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str,
     velocity = np.column_stack([flat, np.zeros(len(flat))])
     spread = np.swapaxes(frame_T_body, 1, 2) @ tracks.velocity_covariance @ frame_T_body
     nothing = vector(np.zeros(3))
-    objects = [
-        {
-            "object_id": {"uuid": list(int(id_).to_bytes(16))},
-            "existence_probability": float(np.clip(score, 0, 1)),
-            "classification": [{"label": _class_number(names.get(label, label)), "probability": 1.0}],
-            "kinematics": {
-                "pose_with_covariance": {
-                    "pose": pose(boxes.position[k], boxes.yaw[k]),
-                    "covariance": covariance(tracks.position_covariance[k]),
-                },
-                "twist_with_covariance": {
-                    "twist": {"linear": vector(velocity[k]), "angular": nothing},
-                    "covariance": covariance(spread[k]),
-                },
-                "acceleration_with_covariance": {
-                    "accel": {"linear": nothing, "angular": nothing},
-                    "covariance": [0.0] * 36,
-                },
-                "orientation_availability": _AVAILABLE if np.isfinite(boxes.yaw[k]) else _UNAVAILABLE,
-                "is_stationary": False,
+    labels = [_class_number(names.get(label, label)) for label in boxes.label.tolist()]
+    objects = {
+        "object_id": {"uuid": np.pad(_bytes_of(tracks.id), ((0, 0), (8, 0)))},
+        "existence_probability": np.clip(tracks.score, 0, 1),
+        "classification": [{"label": labels, "probability": 1.0}],
+        "kinematics": {
+            "pose_with_covariance": {
+                "pose": pose(boxes.position, boxes.yaw),
+                "covariance": covariance(tracks.position_covariance),
             },
-            "shape": {"type": 0, "footprint": {"points": []}, "dimensions": vector(boxes.size[k])},
-        }
-        for k, (id_, label, score) in enumerate(_named(tracks))
-    ]
-    return {"header": header(stamp, frame), "objects": objects}
+            "twist_with_covariance": {
+                "twist": {"linear": vector(velocity), "angular": nothing},
+                "covariance": covariance(spread),
+            },
+            "acceleration_with_covariance": {
+                "accel": {"linear": nothing, "angular": nothing},
+                "covariance": np.zeros(36),
+            },
+            "orientation_availability": np.where(np.isfinite(boxes.yaw), _AVAILABLE, _UNAVAILABLE),
+            "is_stationary": False,
+        },
+        "shape": {"type": 0, "footprint": {"points": []}, "dimensions": vector(boxes.size)},
+    }
+    return {"header": header(stamp, frame), "objects": Columns(len(labels), objects)}
 
 
-def _named(tracks: Tracks) -> Any:
-    """Id, class and score of each track."""
-    return zip(tracks.id.tolist(), tracks.boxes.label.tolist(), tracks.score.tolist(), strict=True)
+def _bytes_of(ids: IntArray) -> NDArray[np.uint8]:
+    """The eight bytes (N, 8) of each number, the first one the highest."""
+    return ids.astype(">i8").view(np.uint8).reshape(-1, 8)
 
 
 def _autoware_size(shape: Any) -> tuple[float, float, float]:
@@ -354,22 +312,50 @@ def _vision_rows(message: Any) -> ObjectRows:
 
 def _vision_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, str]) -> Message:
     boxes, head = tracks.boxes, header(stamp, frame)
-    places = [pose(position, yaw) for position, yaw in zip(boxes.position, boxes.yaw.tolist(), strict=True)]
-    detections = [
-        {
-            "header": head,
-            "results": [
-                {
-                    "hypothesis": {"class_id": names.get(label, label), "score": score},
-                    "pose": {"pose": places[k], "covariance": covariance(tracks.position_covariance[k])},
-                }
-            ],
-            "bbox": {"center": places[k], "size": vector(boxes.size[k])},
-            "id": str(id_),
-        }
-        for k, (id_, label, score) in enumerate(_named(tracks))
-    ]
-    return {"header": head, "detections": detections}
+    place = pose(boxes.position, boxes.yaw)
+    hypothesis = {
+        "hypothesis": {"class_id": [names.get(label, label) for label in boxes.label.tolist()], "score": tracks.score},
+        "pose": {"pose": place, "covariance": covariance(tracks.position_covariance)},
+    }
+    detections = {
+        "header": head,
+        "results": [hypothesis],
+        "bbox": {"center": place, "size": vector(boxes.size)},
+        "id": [str(id_) for id_ in tracks.id.tolist()],
+    }
+    return {"header": head, "detections": Columns(len(boxes), detections)}
+
+
+def _marker_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, str]) -> Message:
+    """A box and a text for each track; the first marker removes those before."""
+    boxes, n = tracks.boxes, len(tracks)
+    size = np.where(np.isfinite(boxes.size), boxes.size, _UNKNOWN_SIZE)
+    above = boxes.position + size * [0, 0, 0.5] + [0, 0, _TEXT_GAP]
+    place = np.concatenate([np.zeros((1, 3)), boxes.position, above])
+    texts = [f"{names.get(label, label)} {id_}" for label, id_ in zip(boxes.label, tracks.id.tolist(), strict=True)]
+    nothing: Message = {"header": header(0, ""), "format": "", "data": []}
+    markers = {
+        "header": header(stamp, frame),
+        "ns": [_MARKERS] + n * [_MARKERS] + n * [f"{_MARKERS} names"],
+        "id": np.arange(1 + 2 * n),
+        "type": np.repeat([_CUBE, _CUBE, _TEXT], [1, n, n]),
+        "action": np.repeat([_DELETE_ALL, 0], [1, 2 * n]),
+        "pose": pose(place, np.concatenate([[0.0], boxes.yaw, np.zeros(n)])),
+        "scale": vector(np.concatenate([np.zeros((1, 3)), size, np.full((n, 3), 1.0)])),
+        "color": {**_COLOUR, "a": np.repeat([0.0, 0.5, 1.0], [1, n, n])},
+        "lifetime": {"sec": 1, "nanosec": 0},
+        "text": ["", *n * [""], *texts],
+        "frame_locked": False,
+        "points": [],
+        "colors": [],
+        "texture_resource": "",
+        "texture": nothing,
+        "uv_coordinates": [],
+        "mesh_resource": "",
+        "mesh_file": {"filename": "", "data": []},
+        "mesh_use_embedded_materials": False,
+    }
+    return {"markers": Columns(1 + 2 * n, markers)}
 
 
 _SCENE_FIELDS = {
@@ -385,6 +371,8 @@ _CLASS, _SCORE = ("class", "label", "category", "type"), ("score", "confidence",
 _POSITION, _VELOCITY = ("cov_xx", "cov_xy", "cov_yy"), ("cov_vxvx", "cov_vxvy", "cov_vyvy")
 _COLOUR = {"r": 0.1, "g": 0.45, "b": 0.9, "a": 0.5}
 _TEXT_GAP = 0.4  # m above the box
+_UNKNOWN_SIZE = 0.5  # m
+_CUBE, _TEXT, _DELETE_ALL, _MARKERS = 1, 9, 3, "saga_fg"  # types and action of markers, their namespace
 
 
 def _scene_rows(message: Any) -> ObjectRows:
@@ -424,13 +412,13 @@ def _scene_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, s
     spreads = [upper_triangle(P) for P in (tracks.position_covariance, tracks.velocity_covariance)]
     columns = np.column_stack([tracks.score, boxes.velocity, *spreads]).tolist()
     entities: list[Any] = []
-    for k, (id_, label, _) in enumerate(_named(tracks)):
+    for k, (id_, label) in enumerate(zip(tracks.id.tolist(), boxes.label.tolist(), strict=True)):
         keys = ("score", "vx", "vy", *_POSITION, *_VELOCITY)
         known = {key: f"{value:.6g}" for key, value in zip(keys, columns[k], strict=True) if value == value}
         facts = {"id": str(id_), "class": names.get(label, label), **known}
         if not tracks.settled[k]:
             facts["settled"] = "0"
-        size = np.where(np.isfinite(boxes.size[k]), boxes.size[k], 0.5)
+        size = np.where(np.isfinite(boxes.size[k]), boxes.size[k], _UNKNOWN_SIZE)
         above = boxes.position[k] + [0, 0, size[2] / 2 + _TEXT_GAP]
         text = {"pose": pose(above, 0.0), "billboard": True, "font_size": 12.0, "scale_invariant": True}
         entities.append(
@@ -476,3 +464,8 @@ OBJECT_TYPES = {
     "foxglove.SceneUpdate": _SCENE,
     "foxglove_msgs/SceneUpdate": _SCENE,
 }
+RESULTS = {
+    **{each.result: each.message for each in (_AUTOWARE, _VISION, _SCENE)},
+    "visualization_msgs/MarkerArray": _marker_message,
+}
+"""The message of tracks of each type of results."""

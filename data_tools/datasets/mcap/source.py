@@ -17,15 +17,11 @@ from typing import Any, BinaryIO, Literal, Self
 import numpy as np
 
 from data_tools.datasets.detection_files import TrackRows
-from data_tools.datasets.mcap.dataset import (
-    DEFAULT_EGO,
-    McapRecording,
-    RecordedScene,
-    RecordingOptions,
-    recorded_messages,
-)
+from data_tools.datasets.mcap.dataset import McapRecording, RecordedScene, RecordingOptions, recorded_messages
 from data_tools.datasets.mcap.objects import OBJECT_TYPES, MessageObjects, message_objects
-from data_tools.datasets.mcap.recording import Recording, definition
+from data_tools.datasets.mcap.recording import Recording
+from data_tools.datasets.mcap.ros2_types import definition, encoded
+from data_tools.datasets.mcap.transforms import DEFAULT_EGO
 from data_tools.datasets.results import Results, read_table_results, scene_result
 from data_tools.datasets.source import (
     TRACKING,
@@ -52,16 +48,13 @@ def write_track_messages(path: Path, dataset: McapRecording, scenes: Iterable[tu
 
     Classes go back to the names of the recording. Raises `InputError` for a path that is not writable.
     """
-    names: dict[str, str] = {}
-    for theirs, ours in dataset.options.classes.items():
-        names.setdefault(ours, theirs)
     with atomic_file(path) as file:
         write, finish = _writer(file, dataset.form.result)
         for scene, moments in scenes:
             assert isinstance(scene, RecordedScene)
             for token, tracks in zip(scene.tokens, moments, strict=True):
                 stamp = int(token)
-                message = dataset.form.message(tracks, stamp, scene.world, names)
+                message = dataset.form.message(tracks, stamp, scene.world, dataset.options.names)
                 write(message, stamp)
         finish()
 
@@ -69,15 +62,17 @@ def write_track_messages(path: Path, dataset: McapRecording, scenes: Iterable[tu
 def _writer(file: BinaryIO, type_: str) -> tuple[Callable[[Any, int], None], Callable[[], None]]:
     """Functions that write a message of a type with its time, ns, and that end the file."""
     import mcap_protobuf.writer
-    import mcap_ros2.writer
+    from mcap.writer import Writer
 
     text = definition(type_)
     if text is None:
         protobuf: Any = mcap_protobuf.writer.Writer(file)
         return lambda message, time: protobuf.write_message(TOPIC, message, time, time), protobuf.finish
-    ros: Any = mcap_ros2.writer.Writer(file)
-    schema = ros.register_msgdef(type_.replace("/", "/msg/"), text)
-    return lambda message, time: ros.write_message(TOPIC, schema, message, time, time), ros.finish
+    ros = Writer(file)
+    ros.start(profile="ros2", library="saga-fg")
+    schema = ros.register_schema(type_.replace("/", "/msg/"), "ros2msg", text.encode())
+    channel = ros.register_channel(TOPIC, "cdr", schema)
+    return lambda message, time: ros.add_message(channel, time, encoded(type_, message), time), ros.finish
 
 
 def read_track_messages(path: Path, scene: RecordedScene, classes: Mapping[str, str]) -> TrackRows:
@@ -188,21 +183,30 @@ class McapSource(DatasetSource):
             return Results({name: scene_result(scene, rows, result)})
 
     def _options(self) -> RecordingOptions:
-        topics: dict[str, str] = {}
-        for value in self.topic or ():
-            sensor, equals, topic = value.rpartition("=")
-            sensor = sensor if equals else topic.lstrip("/")
-            if not sensor or not topic:
-                raise InputError(f"--topic {value}: expected a topic, or SENSOR=TOPIC")
-            if sensor in topics:
-                raise InputError(f"--topic {value}: the sensor {sensor} is given twice")
-            topics[sensor] = topic
+        topics = sensor_topics("--topic", self.topic or ())
         return RecordingOptions(topics, pairs("--classes", self.classes), self.world, self.ego, self.odometry)
 
     def _one(self) -> str:
         if len(self.recording or ()) != 1:
             raise InputError("expected one recording; several need --workers N or --ray, and a folder as --output")
         return (self.recording or [""])[0]
+
+
+def sensor_topics(option: str, values: Iterable[str]) -> dict[str, str]:
+    """Return the topic of each sensor by the values of an option, TOPIC or SENSOR=TOPIC.
+
+    Raises `InputError` for others.
+    """
+    topics: dict[str, str] = {}
+    for value in values:
+        sensor, equals, topic = value.rpartition("=")
+        sensor = sensor if equals else topic.lstrip("/")
+        if not sensor or not topic:
+            raise InputError(f"{option} {value}: expected a topic, or SENSOR=TOPIC")
+        if sensor in topics:
+            raise InputError(f"{option} {value}: the sensor {sensor} is given twice")
+        topics[sensor] = topic
+    return topics
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ pytest.importorskip("mcap_ros2")
 pytest.importorskip("rosbags")
 
 from data_tools.datasets.mcap.dataset import McapRecording, RecordingOptions
-from data_tools.datasets.mcap.objects import nanoseconds
-from data_tools.datasets.mcap.recording import definition, plain_type
+from data_tools.datasets.mcap.ros2_types import definition, nanoseconds, plain_type
 from saga_fg import InputError
 from saga_fg.numerics.geometry import yaw_transform
 from tests.data_tools import mcap_example as example

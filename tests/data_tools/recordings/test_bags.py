@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.scans import SimulatedScans, laser_drive
-from data_tools.datasets.mcap.recording import _FIELDS
+from data_tools.datasets.mcap.ros2_types import fields_of
 from data_tools.lidar import Scan
 from data_tools.recordings import RecordingOptions, open_recording, read_bag_laser
 from data_tools.recordings.bags import cloud_columns
@@ -258,4 +258,4 @@ def test_definitions_are_those_of_ros() -> None:
     store = example.typestore()
     for name in ("PointField", "PointCloud2", "LaserScan", "Imu", "NavSatStatus", "NavSatFix"):
         theirs = [field for field, _ in store.fielddefs[f"sensor_msgs/msg/{name}"][1]]
-        assert [field.split()[1] for field in _FIELDS[f"sensor_msgs/{name}"].split(", ")] == theirs
+        assert [field.name for field in fields_of(f"sensor_msgs/{name}")] == theirs
