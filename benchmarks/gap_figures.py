@@ -11,7 +11,7 @@ from benchmarks.bootstrap import Comparison, Interval, difference, paired_bootst
 from benchmarks.gap_runs import LivedRun, Prediction
 from benchmarks.situations import SITUATIONS
 from data_tools.metrics import coverage
-from saga_fg.learning.gaps import LENGTHS
+from saga_fg.learning.labelled_scene import LENGTHS
 from saga_fg.numerics.arrays import FloatArray
 
 PROBABILITIES = (0.5, 0.9)

@@ -18,12 +18,11 @@ import numpy as np
 from benchmarks.gap_runs import LivedRun, judged_run, judgement
 from benchmarks.recording_sets import RecordingSet
 from benchmarks.situations import colours_at
+from data_tools.figures import COLOURS, png
 from data_tools.files.atomic_files import write_bytes
-from data_tools.plots import COLOURS, png
 from pipelines.learning.gaps import CAP, Contender, JudgedRun
 from saga_fg.errors import InputError
-from saga_fg.learning.gaps import Gap
-from saga_fg.learning.labelled_scene import LabelledScene
+from saga_fg.learning.labelled_scene import Gap, LabelledScene
 from saga_fg.numerics.arrays import FloatArray
 
 BEFORE, AFTER = 1.5, 1.0  # s

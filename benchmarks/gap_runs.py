@@ -22,8 +22,7 @@ from benchmarks.situations import situations_of
 from data_tools.metrics import nees
 from pipelines.learning.gaps import CAP, Contender, Errors, JudgedRun, classes_of, tracks_without
 from pipelines.tracking import Progress
-from saga_fg.learning.gaps import LENGTHS, LONGEST, Gap, is_moving, made_gaps, reached
-from saga_fg.learning.labelled_scene import LabelledScene
+from saga_fg.learning.labelled_scene import LENGTHS, LONGEST, Gap, LabelledScene, is_moving, made_gaps, reached
 from saga_fg.model.sensor import Sensor
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Scene

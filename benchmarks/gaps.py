@@ -33,7 +33,7 @@ from pipelines.learning.interactions import LEARNED, LearningSettings, learn_int
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learning import measured_trajectories
-from saga_fg.learning.gaps import LENGTHS, Gap
+from saga_fg.learning.labelled_scene import LENGTHS, Gap
 from saga_fg.numerics.arrays import FloatArray
 
 FITS = ("noise", "edges")

@@ -19,9 +19,8 @@ from benchmarks.landmark_mapper import LandmarkMapper, MapperSettings
 from benchmarks.recordings.landmarks import LandmarkLog, read_landmark_log
 from benchmarks.recordings.ranges import compared, map_beacons
 from benchmarks.runner import Rows, each
-from data_tools.figures import write_figures
+from data_tools.figures import paths_from_above, png, write_figures
 from data_tools.files.atomic_files import atomic_directory, check_writable_folder, write_bytes
-from data_tools.plots import paths_from_above, png
 from data_tools.trajectories import Trajectory, write_kitti_poses, write_tum_poses
 from pipelines.slam.results import landmark_row, landmark_rows, planar_trajectory
 from saga_fg.errors import InputError

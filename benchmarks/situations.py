@@ -20,9 +20,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from saga_fg.learning.gaps import MOVING, Gap, reached
 from saga_fg.learning.interaction_fit import ROAD_USERS
-from saga_fg.learning.labelled_scene import LabelledScene
+from saga_fg.learning.labelled_scene import MOVING, Gap, LabelledScene, reached
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import feet, wrap_angle
 from saga_fg.types.boxes import Boxes

@@ -51,7 +51,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
 from saga_fg.parts import new_part, of_own_code, part_kind
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Scene
-from saga_fg.types.shown import html_table, text_table
+from saga_fg.types.track import html_table, text_table
 
 __all__ = [
     "Evaluation",

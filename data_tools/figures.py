@@ -1,10 +1,11 @@
-"""Figures for people and programs: tables of texts, charts as numbers, and JSON with null for undefined numbers."""
+"""Figures and pictures: tables of texts, charts as numbers, JSON with null for undefined numbers, and plots."""
 
 from __future__ import annotations
 
+import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -95,3 +96,103 @@ def as_json(value: Any) -> Any:
 def write_figures(path: str | Path, figures: Any) -> None:
     """Write figures as JSON, whole or not at all. Raises `InputError` for a path that is not writable."""
     write_text(path, json.dumps(as_json(figures), indent=1, allow_nan=False) + "\n")
+
+
+COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#e377c2", "#8c564b", "#637939", "#3949ab")
+
+
+def new_figure(width: float, height: float, **options: Any) -> Any:
+    """Return an empty matplotlib `Figure` of a size in inches."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), **{"layout": "constrained", **options})
+
+
+def png(figure: Any, dpi: int = 110) -> bytes:
+    """Return a figure as the content of a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    return buffer.getvalue()
+
+
+MAX_POINTS = 60_000  # of a map that are drawn, evenly chosen
+MARGIN = 30.0  # m around the paths
+
+
+def paths_from_above(paths: Mapping[str, FloatArray], points: Mapping[str, FloatArray] | None = None) -> Any:
+    """Return a matplotlib `Figure` of paths (N, 2 or 3) and sets of points (K, 2 or 3), m, each under its name.
+
+    The first path is grey and wide, to be seen under those that lie on it.
+    """
+    figure = new_figure(8.0, 8.0)
+    ax = figure.subplots()
+    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    ax.grid(color="#e6e6e6", linewidth=0.6)
+    ax.set_axisbelow(True)
+    for row, ((name, path), colour) in enumerate(zip(paths.items(), ("#c0c0c0", *COLOURS), strict=False)):
+        ax.plot(path[:, 0], path[:, 1], color=colour, linewidth=1.0 if row else 5.0, label=name)
+    others = COLOURS[max(len(paths) - 1, 1) :]
+    for (name, set_), colour, marker in zip((points or {}).items(), others, "^x+os", strict=False):
+        ax.plot(set_[:, 0], set_[:, 1], marker, color=colour, markersize=5, label=name)
+    ax.legend(frameon=False, fontsize=9)
+    return figure
+
+
+def scan_map_from_above(
+    points: FloatArray,
+    paths: Mapping[str, FloatArray],
+    poles: FloatArray,
+    lines: Mapping[str, FloatArray],
+    tracks: Sequence[FloatArray] = (),
+) -> Any:
+    """Return a matplotlib `Figure`; all in world coordinates, m.
+
+    points  (N, 3) of the map, coloured by height
+    paths   (K, 3) by name
+    poles   (P, 2)
+    lines   (W, 2, 2) the two ends of walls and road lines, by kind
+    tracks  (n, 2) of objects
+    """
+    from matplotlib.collections import LineCollection
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    driven = np.concatenate([path[:, :2] for path in paths.values()])
+    (left, bottom), (right, top) = driven.min(axis=0) - MARGIN, driven.max(axis=0) + MARGIN
+    wide = float(np.clip(7.5 * (right - left) / (top - bottom), 4.0, 14.0))
+    tall = min(7.5, wide * (top - bottom) / (right - left))
+    layout = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1)
+    figure = new_figure(wide + 1.7, max(tall, 3.0) + 0.7, layout=layout)
+    ax = figure.subplots()
+    chosen = points[:: max(1, len(points) // MAX_POINTS)]
+    low, high = np.percentile(chosen[:, 2], [5, 95]) if len(chosen) else (0.0, 1.0)
+    x, y, z = chosen.T
+    dots = ax.scatter(x, y, c=z, s=1.2, cmap="viridis", vmin=low, vmax=high, linewidths=0)
+    figure.colorbar(dots, ax=ax, label="height, m", shrink=0.7)
+    for (name, ends), colour in zip(lines.items(), ("#d62728", "#9467bd"), strict=False):
+        if len(ends):
+            ax.add_collection(LineCollection(list(ends), colors=colour, linewidths=1.5, label=name))
+    if len(poles):
+        ax.plot(
+            *poles.T, "o", color="#ff7f0e", markersize=4, markeredgecolor="black", markeredgewidth=0.4, label="poles"
+        )
+    if tracks:
+        ax.add_collection(LineCollection(list(tracks), colors="#2ca02c", linewidths=1.2, label="objects"))
+        ax.plot(*np.array([track[-1] for track in tracks]).T, "s", color="#2ca02c", markersize=3)
+    for row, ((name, path), colour) in enumerate(zip(paths.items(), ("black", "#1f77b4", "#e377c2"), strict=False)):
+        ax.plot(*path[:, :2].T, color=colour, linewidth=1.5 if row else 4.0, label=name)
+    ax.set(aspect="equal", xlabel="x, m", ylabel="y, m", xlim=(left, right), ylim=(bottom, top))
+    ax.legend(frameon=True, fontsize=9, loc="upper right")
+    return figure
+
+
+def occupancy_picture(probability: FloatArray, origin: FloatArray, cell: float, path: FloatArray) -> Any:
+    """Return a matplotlib `Figure` of an occupancy grid (W, H), dark where occupied, and a path (N, 2), m."""
+    width, height = probability.shape
+    size = 12.0 / max(width, height)
+    figure = new_figure(max(3.0, size * width), max(3.0, size * height), dpi=200)
+    ax = figure.subplots()
+    extent = (origin[0], origin[0] + width * cell, origin[1], origin[1] + height * cell)
+    ax.imshow(1 - probability.T, cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent, interpolation="nearest")
+    ax.plot(path[:, 0], path[:, 1], color=COLOURS[0], linewidth=0.6)
+    ax.set(aspect="equal", xlabel="x, m", ylabel="y, m")
+    return figure

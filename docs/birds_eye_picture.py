@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.plots import new_figure, png
+from data_tools.figures import new_figure, png
 from pipelines.config import TrackConfig
 from pipelines.demo import TITLES, Comparison, hardest_moment
 from pipelines.report import scene_of_run

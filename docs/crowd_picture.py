@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.recording_sets import recording_set
+from data_tools.figures import new_figure, png
 from data_tools.metrics import SceneBoxes
 from data_tools.metrics.scene_boxes import nearest_pairs
-from data_tools.plots import new_figure, png
 from pipelines.config import TrackConfig, load_config
 from pipelines.tracking import track_scene
 from saga_fg.numerics.arrays import FloatArray

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.scaling import scaling
+from data_tools.figures import png
 from data_tools.files.atomic_files import write_bytes
-from data_tools.plots import png
 
 
 def write_scaling_picture(path: Path) -> None:

@@ -21,7 +21,6 @@ from factors.gaussian import (
     prior_factor,
     prior_factors,
 )
-from factors.lines_and_planes import HesseLine, line_factors, plane, plane_factor
 from factors.manifolds import ImuBias, OrientedPlane, PlanarPose, SpatialPose, Variable, Vector
 from factors.measurement import (
     Bearing,
@@ -34,7 +33,7 @@ from factors.measurement import (
     detection_factors,
 )
 from factors.nonlinear import ResidualFactors, residual_factor
-from factors.relative import relative_factors
+from factors.relative import HesseLine, line_factors, plane, plane_factor, relative_factors
 from factors.robust import Mixture, Robust, RobustLoss
 from factors.solver import Linearisable, Solution, SolverSettings, linearised, solve
 from factors.validation import FactorError, SingularSystemError

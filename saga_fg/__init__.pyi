@@ -2,10 +2,9 @@ import data_tools.datasets.data_frames as _judged
 import pipelines.report.data_frames as _shown
 
 from .errors import InputError, MissingExtraError, SagaError, UnknownNodeError
-from .model.ground_camera import GroundCamera
 from .model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NodeType, RandomWalk
 from .model.scene_graph import Edges, SceneGraph
-from .model.sensor import Sensor
+from .model.sensor import GroundCamera, Sensor
 from .smoothing import smooth
 from .tables.column_names import TableImport
 from .tables.detections import frames_of

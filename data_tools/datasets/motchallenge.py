@@ -40,7 +40,7 @@ from data_tools.files.input_files import read_text
 from data_tools.metrics import SceneBoxes
 from data_tools.metrics.hota import SceneSimilarities, image_overlaps, similarity_metrics
 from saga_fg.errors import InputError, error_context
-from saga_fg.model.ground_camera import GroundCamera
+from saga_fg.model.sensor import GroundCamera
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.types.dataset import Annotations, Dataset, Scene
 from saga_fg.types.frame import Frame

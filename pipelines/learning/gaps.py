@@ -17,8 +17,7 @@ import numpy as np
 from data_tools.metrics.scene import match_scene
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, track_scene
-from saga_fg.learning.gaps import LONGEST, Gap, made_gaps, reached
-from saga_fg.learning.labelled_scene import LabelledScene
+from saga_fg.learning.labelled_scene import LONGEST, Gap, LabelledScene, made_gaps, reached
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.dataset import Scene
 from saga_fg.types.frame import Frame

@@ -35,8 +35,8 @@ from pipelines.learning.gaps import Contender, Errors, Run, judged_on
 from pipelines.tracking import Progress, track_scene
 from saga_fg.errors import InputError
 from saga_fg.learning import MAX_GAPS, TEMPLATE, HiddenObjects, Rule, fit_interactions, hidden_objects
-from saga_fg.learning.gaps import LENGTHS
 from saga_fg.learning.hidden_objects import FOLLOWED, LONGEST
+from saga_fg.learning.labelled_scene import LENGTHS
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.sensor import Sensor

@@ -53,12 +53,11 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.figures import write_figures
+from data_tools.figures import occupancy_picture, paths_from_above, png, scan_map_from_above, write_figures
 from data_tools.files.atomic_files import atomic_directory, write_bytes, write_text
 from data_tools.laser import LaserLog, OccupancyGrid
 from data_tools.lidar import write_cloud
 from data_tools.lidar.scan import ScanSequence
-from data_tools.plots import occupancy_picture, paths_from_above, png, scan_map_from_above
 from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.slam.driver import SlamResult

@@ -31,7 +31,7 @@ from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, St
 from saga_fg.numerics.geometry import near_pairs
 from saga_fg.smoothing.association import Evidence
 from saga_fg.smoothing.states import Lifespans, Probabilities, StateTable
-from saga_fg.types.shown import data_frame, text_table
+from saga_fg.types.track import data_frame, text_table
 
 HANDED_OUT = 0.5  # P(exists)
 LEAST_GAIN = 0.05  # of an object that is worth a look

@@ -41,8 +41,8 @@ from typing import NamedTuple
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.kernels.identities import association_marginals
 from saga_fg.kernels.pairs import gated_pairs
+from saga_fg.kernels.tracks import association_marginals
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, common_numbers
 from saga_fg.numerics.assignment import (
     CrossCovariances,

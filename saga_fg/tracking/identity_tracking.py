@@ -9,8 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.model.ground_camera import GroundCamera
-from saga_fg.model.sensor import Sensor
+from saga_fg.model.sensor import GroundCamera, Sensor
 from saga_fg.numerics.arrays import IntArray, checked
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.table_tracking import UNNAMED

@@ -24,7 +24,7 @@ from saga_fg.numerics.geometry import checked_transform
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
 from saga_fg.types.landmark import Observation
 from saga_fg.types.road_map import RoadMap
-from saga_fg.types.shown import html_table, text_table
+from saga_fg.types.track import html_table, text_table
 
 _TANGENT = {3: 3, 4: 6}  # dimension of the motions of so large a transform
 

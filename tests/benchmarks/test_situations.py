@@ -10,8 +10,7 @@ from benchmarks.gap_runs import Judgement, LivedRun, Prediction, judgement
 from benchmarks.situations import route_of, situations_of
 from pipelines.learning.gaps import JudgedRun
 from saga_fg import Annotations, Boxes, Detections, Frame, Scene, Tracks
-from saga_fg.learning.gaps import Gap
-from saga_fg.learning.labelled_scene import LabelledScene
+from saga_fg.learning.labelled_scene import Gap, LabelledScene
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.types.road_map import RoadMap, StopLine, TrafficLight
 

@@ -31,7 +31,7 @@ from pipelines.config import Family, load_config
 from pipelines.learning.gaps import CAP, JudgedRun
 from pipelines.learning.interactions import LearnedForms
 from saga_fg import InputError
-from saga_fg.learning.gaps import Gap
+from saga_fg.learning.labelled_scene import Gap
 from saga_fg.model.edge_rules import Following
 from saga_fg.model.stability import LearnedInteractions
 from tests.pipelines.sampled_gaps import HIDDEN, SEEN, SHORT, TIMES, labelled, straight, tracks, without

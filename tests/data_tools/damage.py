@@ -48,7 +48,7 @@ from pipelines.review import read_label_run
 from pipelines.serving import StateKeeper, StreamTracker
 from pipelines.slam.configuration import SlamConfig, load_slam_config
 from pipelines.slam.submaps import SlamMap, read_map, write_map
-from saga_fg.model.ground_camera import GroundCamera
+from saga_fg.model.sensor import GroundCamera
 from saga_fg.smoothing.corrections import correction_from
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Dataset, Scene

@@ -17,8 +17,7 @@ from pipelines.config import TrackConfig, load_config
 from pipelines.learning.gaps import hidden
 from pipelines.tracking import track_dataset, track_scene
 from saga_fg import Boxes, Detections, Frame, Scene, Tracks
-from saga_fg.learning.gaps import FOLLOWED, LENGTHS, SPACING, made_gaps
-from saga_fg.learning.labelled_scene import LabelledScene
+from saga_fg.learning.labelled_scene import FOLLOWED, LENGTHS, SPACING, LabelledScene, made_gaps
 from tests.pipelines.command import done
 from tests.pipelines.sampled_gaps import SHORT
 

@@ -12,7 +12,7 @@ from data_tools.metrics import scene_metrics
 from pipelines.config import load_config
 from pipelines.tracking import track_scene
 from saga_fg import ConstantAcceleration, ConstantVelocity, RandomWalk, Tracker, TrackerSettings
-from saga_fg.kernels.identities import association_marginals
+from saga_fg.kernels.tracks import association_marginals
 from saga_fg.model.edge_rules import Neighbours
 from saga_fg.model.modes import Mixture
 from saga_fg.model.sensor import NoiseModel, Sensor
