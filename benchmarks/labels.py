@@ -5,6 +5,7 @@ refined     `saga-fg smooth --tracks`; shuffled: after the identities of every f
             the boxes alone are left
 together    both methods' tracks refined to one result
 detections  labels from the detections that all of them had, by `saga-fg smooth`; tracked: by `saga-fg track`
+headings    of these labels: the share that is turned round, of boxes that match a true object, all and handed out
 doubt       of these labels: how often what they say with a probability is so
 corrected   by an annotator who knows the truth and looks at a tenth of their tracks (`benchmarks.annotator`)
 """
@@ -14,10 +15,11 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from benchmarks.annotator import Answers, Corrected, judged, moments_of
+from benchmarks.annotator import Answers, Corrected, JudgedLabels, judged, moments_of
 from benchmarks.recording_sets import RecordingOptions, RecordingSet, chosen_sets
 from benchmarks.runner import Data, Row, Rows, Seed, each
 from data_tools.datasets.given_tracks import sensor_names, with_tracks
@@ -50,7 +52,7 @@ def set_rows(recordings: RecordingSet, seed: int) -> Iterable[Row]:
     """A row for each way to the labels."""
     runs: dict[str, dict[str, TrackedScene]] = {}
     online, offline = load_config(recordings.family), load_smooth_config(recordings.family)
-    rng, answers = np.random.default_rng(seed), Answers()
+    rng, answers, judgements = np.random.default_rng(seed), Answers(), list[JudgedLabels]()
     corrected = Corrected(np.random.default_rng(seed))
     for name in each(recordings.dataset.scenes, recordings.name):
         scene = recordings.scene(name)
@@ -67,7 +69,8 @@ def set_rows(recordings: RecordingSet, seed: int) -> Iterable[Row]:
         made, _ = builder.finish()
         corrected.add(scene, builder, made, time.perf_counter() - start)
         moments = moments_of(made)
-        answers.add(judged(scene, moments), moments)
+        judgements.append(judged(scene, moments))
+        answers.add(judgements[-1], moments)
         runs.setdefault("detections, labels", {})[name] = as_run(scene, [moment.tracks for moment in moments])
         wanted = {f"{method}, refined": [result] for method, result in given.items()}
         wanted |= {f"{method}, shuffled": [shuffled(result, rng)] for method, result in given.items()}
@@ -78,10 +81,27 @@ def set_rows(recordings: RecordingSet, seed: int) -> Iterable[Row]:
             runs.setdefault(variant, {})[name] = as_run(scene, labelled.tracks)
     for variant, found in sorted(runs.items()):
         yield f"{recordings.name}: {len(found)} scenes", {"labels": variant, **figures(recordings, found)}
+    for row in heading_rows(judgements):
+        yield f"{recordings.name}: headings", row
     for row in answers.rows():
         yield f"{recordings.name}: doubt", row
     for row in corrected.rows():
         yield f"{recordings.name}: corrected", row
+
+
+def heading_rows(scenes: Sequence[JudgedLabels]) -> Iterable[dict[str, Any]]:
+    """A row for each class."""
+    matches = [scene.own >= 0 for scene in scenes]
+    label = np.concatenate([scene.found.boxes.label[rows] for scene, rows in zip(scenes, matches, strict=True)])
+    turned, kept = (
+        np.concatenate([getattr(scene, name)[rows] for scene, rows in zip(scenes, matches, strict=True)])
+        for name in ("turned", "kept")
+    )
+    for name in np.unique(label).tolist():
+        mine = label == name
+        handed = mine & kept
+        shares = {"all": turned[mine].mean(), "handed out": turned[handed].mean() if handed.any() else np.nan}
+        yield {"class": name, "boxes": int(mine.sum()), "of them handed out": int(handed.sum()), **shares}
 
 
 def as_run(scene: Scene, tracks: Sequence[Tracks]) -> TrackedScene:
