@@ -274,10 +274,10 @@ def test_every_edge_of_a_frame_is_a_factor_of_isam2(recordings, monkeypatch):
     monkeypatch.setattr(GraphFilter, "predict", traced)
     chosen, config = recording_set("kitti", recordings, 1), load_config("kitti")
     tracker = replace(config, tracker=replace(config.tracker, estimator="isam2")).new_tracker("saga")
-    for frame in chosen.dataset.scene("0011").frames:
+    for frame in list(chosen.dataset.scene("0011").frames)[:120]:
         tracker.step(frame)
     edges, found, wide = np.sum(frames, axis=0)
     print(f"{len(frames)} frames with {edges} edges, {found} of them factors of iSAM2; {wide} of three or more in all")
     assert found == edges
-    assert len(frames) > 200
-    assert wide > 600
+    assert len(frames) > 60
+    assert wide > 180
