@@ -277,3 +277,24 @@ def test_the_search_finds_what_it_looks_for():
     assert len(faults(ast.parse(bad))) == 6
     assert faults(ast.parse("import pickle\npickle.dump(x, file)\n")) == []
     assert faults(ast.parse("import pickle\npickle.dump(x, file)\npickle.load(file)\n")) == ["pickle"]
+
+
+@pytest.mark.parametrize(
+    ("tag", "heading", "expected"),
+    [
+        ("v9.9.9", "## Unreleased", r"expected the tag v(\S+), as in pyproject\.toml, got v9\.9\.9"),
+        ("", "## Unreleased", r"CHANGELOG\.md: expected the heading '## \S+ \(YYYY-MM-DD\)'"),
+        ("", "## 9.9.9 (2030-01-31)", r"CHANGELOG\.md: expected the heading '## \S+ \(YYYY-MM-DD\)'"),
+    ],
+)
+def test_a_release_without_its_heading_or_of_another_tag_is_refused(tmp_path, tag, heading, expected):
+    (tmp_path / ".ci").mkdir()
+    for name in (".ci/release", "pyproject.toml", "CITATION.cff"):
+        shutil.copy(ROOT / name, tmp_path / name)
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    (tmp_path / "CHANGELOG.md").write_text(f"# Changelog\n\n{heading}\n")
+    command = ["bash", str(tmp_path / ".ci" / "release"), str(tmp_path / "dist"), tag or f"v{version}"]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 1
+    assert re.fullmatch(f"error: {expected}\n", run.stderr)
+    assert not list((tmp_path / "dist").iterdir())

@@ -127,7 +127,7 @@ def over_dds(objects: int, seconds: float, seed: int, domain: int = 71) -> dict[
     node = subprocess.Popen(command)
     try:
         peer = Peer(objects, seed)
-        peer.wait(node, 60.0)
+        peer.wait(node, 300.0)
         frames = WARM_UP + round(seconds / INTERVAL)
         begin, clock, before = time.monotonic(), time.time_ns(), 0.0
         stamps = [clock + round(k * INTERVAL * 1e9) for k in range(frames)]
