@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from data_tools.datasets import import_options
-from data_tools.datasets.detection_files import TableImport, TruthTable, read_truth
+from data_tools.datasets.detection_files import TableImport, TruthTable, read_tracks, read_truth
 from data_tools.datasets.detection_files.dataset import read_detections, read_scenes_in_parts
-from data_tools.datasets.results import Results, SceneResult, clear_figures, read_table_results
+from data_tools.datasets.results import Results, SceneResult, clear_figures, table_results
 from data_tools.datasets.source import (
     TRACKING,
     ChosenScenes,
@@ -174,13 +174,14 @@ class DetectionFileSource(DatasetSource):
         return Results(self._results(result, truth), _score)
 
     def _results(self, result: Path, truth: bool) -> Mapping[str, SceneResult]:
+        rows = read_tracks(result, self.how, lenient=True)
         if truth and self.truth is not None:
             with self._true_scenes() as true_scenes:
-                return read_table_results(result, true_scenes, self.scenes is not None, self.how, judged=True)
+                return table_results(rows, result, true_scenes, self.scenes is not None, self.how, judged=True)
         if self.detections is None:
-            return read_table_results(result, None, how=self.how)
+            return table_results(rows, result, None, how=self.how)
         with self.open() as dataset:
-            return read_table_results(result, dataset, every_scene=truth, how=self.how, own_times=not truth)
+            return table_results(rows, result, dataset, every_scene=truth, how=self.how, own_times=not truth)
 
     def option_for(self, mend: Mend) -> str:
         return self.how.option_for(mend, {})

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -27,8 +28,9 @@ import numpy as np
 
 from data_tools.datasets.results import SceneResult
 from data_tools.metrics import SceneBoxes
+from data_tools.metrics.scene_boxes import near_pairs
 from saga_fg.numerics.arrays import BoolArray, IntArray
-from saga_fg.numerics.geometry import near_pairs, wrap_angle
+from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.types.boxes import Boxes
 
 SAME = 0.02  # m and rad; Datumaro writes two decimals
@@ -159,21 +161,15 @@ def _pairs(ours: SceneBoxes, theirs: SceneBoxes) -> IntArray:
         names = dict.fromkeys([*ours.id[pair[mine]].tolist(), *([id_] if kept else [])])
         named += [(place[k, name], row) for name in names if (k, name) in place]
     _take(pair, named)
-    near = _near(ours, theirs, REACH)
-    moved = ours.boxes.position[near[:, 0]] - theirs.boxes.position[near[:, 1]]
-    _take(pair, near[np.argsort(np.linalg.norm(moved, axis=1), kind="stable")])
+    _take(pair, _near(ours, theirs, REACH))
     return pair
 
 
 def _near(ours: SceneBoxes, theirs: SceneBoxes, reach: float) -> IntArray:
-    """(P, 2) rows of boxes of one frame within a reach, m."""
-    found = [np.empty((0, 2), dtype=np.int64)]
-    for k in np.intersect1d(ours.frame, theirs.frame).tolist():
-        a, b = (slice(*np.searchsorted(each.frame, [k, k + 1])) for each in (ours, theirs))
-        here = ours.boxes.position[a, :2]
-        i, j = near_pairs(here, theirs.boxes.position[b, :2], np.full(len(here), reach))
-        found.append(np.column_stack([i + a.start, j + b.start]))
-    return np.concatenate(found)
+    """(P, 2) rows of boxes of one frame within a reach, m, the nearest first."""
+    placed = [(each.frame, replace(each.boxes, label=np.full(len(each), "any"))) for each in (ours, theirs)]
+    row, column, distance = near_pairs(placed[0], placed[1], reach)
+    return np.column_stack([row, column])[np.argsort(distance, kind="stable")]
 
 
 def _take(pair: IntArray, candidates: Iterable[Any]) -> None:

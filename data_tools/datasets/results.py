@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from data_tools.datasets.detection_files import TableImport, TrackRows, read_tracks
+from data_tools.datasets.detection_files import TableImport, TrackRows
 from data_tools.metrics import SceneBoxes
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import FloatArray, IntArray
@@ -81,19 +81,6 @@ class Results:
 
         pairs = [(each.scene, each.found) for each in self.scenes.values()]
         return replace(evaluation, own=own_figures(pairs, metrics))
-
-
-def read_table_results(
-    path: Path,
-    dataset: Dataset | None,
-    every_scene: bool = False,
-    how: TableImport | None = None,
-    judged: bool = False,
-    own_times: bool = False,
-) -> dict[str, SceneResult]:
-    """Read a table of tracks, see `table_results`; how: what it takes to understand it, if saga-fg did not write it."""
-    rows = read_tracks(path, how, lenient=True)
-    return table_results(rows, path, dataset, every_scene, how, judged, own_times)
 
 
 def table_results(

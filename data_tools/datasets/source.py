@@ -105,9 +105,11 @@ class Parts:
 
 @dataclass(frozen=True, eq=False)
 class HeldScene:
-    """A scene in memory; a dataset of itself. Its inputs are its moments and the frames of each sensor."""
+    """A scene in memory; a dataset of itself. Its inputs are its moments, the frames of each sensor, and `meta`, what
+    else results depend on."""
 
     held: Scene
+    meta: Any = None
 
     @property
     def name(self) -> str:
@@ -127,7 +129,8 @@ class HeldScene:
     @contextmanager
     def opened(self) -> Iterator[OpenedPart]:
         """Open with the digests of everything in the scene but its ground truth."""
-        yield OpenedPart(scene_digests(self.held), lambda: self)
+        about = {} if self.meta is None else {"meta": hashlib.sha256(repr(self.meta).encode()).hexdigest()}
+        yield OpenedPart({**scene_digests(self.held), **about}, lambda: self)
 
 
 def scene_digests(scene: Scene) -> dict[str, str]:
@@ -380,11 +383,12 @@ class DatasetSource(ABC):
         The scenes are those the result has; where the field `scenes` names some, all of these. truth: with ground
         truth, if there is some
         """
-        from data_tools.datasets.results import Results, read_table_results
+        from data_tools.datasets.detection_files import read_tracks
+        from data_tools.datasets.results import Results, table_results
 
         named = isinstance(getattr(self, "scenes", None), str)
         with self.open(truth=truth and self.has_truth) as dataset:
-            return Results(read_table_results(result, dataset, every_scene=named))
+            return Results(table_results(read_tracks(result, lenient=True), result, dataset, every_scene=named))
 
 
 Kind = Literal["drivable", "walkway", "crossing"]

@@ -16,13 +16,13 @@ from typing import Any, BinaryIO, Literal, Self
 
 import numpy as np
 
-from data_tools.datasets.detection_files import TrackRows
+from data_tools.datasets.detection_files import TrackRows, read_tracks
 from data_tools.datasets.mcap.dataset import McapRecording, RecordedScene, RecordingOptions, recorded_messages
 from data_tools.datasets.mcap.objects import OBJECT_TYPES, MessageObjects, message_objects
 from data_tools.datasets.mcap.recording import Recording
 from data_tools.datasets.mcap.ros2_types import definition, encoded
 from data_tools.datasets.mcap.transforms import DEFAULT_EGO
-from data_tools.datasets.results import Results, read_table_results, scene_result
+from data_tools.datasets.results import Results, scene_result, table_results
 from data_tools.datasets.source import (
     TRACKING,
     DatasetSource,
@@ -176,7 +176,7 @@ class McapSource(DatasetSource):
     def read_results(self, result: Path, truth: bool = True) -> Results:
         with self.open() as dataset:
             if result.suffix != ".mcap":
-                return Results(read_table_results(result, dataset, every_scene=True))
+                return Results(table_results(read_tracks(result, lenient=True), result, dataset, every_scene=True))
             (name,) = dataset.scenes
             scene = dataset.scene(name)
             rows = read_track_messages(result, scene, pairs("--classes", self.classes))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from hashlib import sha256
 from pathlib import Path
 from typing import Self
 
@@ -15,7 +14,6 @@ from data_tools.datasets.nuscenes.dataset import NuScenes, nuscenes_images, nusc
 from data_tools.datasets.nuscenes.results import (
     MAX_BOXES,
     ResultBoxes,
-    ResultMeta,
     merge_tracking_results,
     read_tracking_results,
     write_tracking_results,
@@ -28,14 +26,12 @@ from data_tools.datasets.source import (
     DatasetSource,
     HeldScene,
     LabelledScenes,
-    OpenedPart,
     Parts,
     ResultFormat,
     Surroundings,
     TrackedScenes,
     names,
     option,
-    scene_digests,
     tracks_of,
 )
 from data_tools.evaluation import (
@@ -190,7 +186,7 @@ class NuScenesFormat(ResultFormat):
     classes = tuple(CATEGORY_OF_CLASS)
 
     def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
-        assert isinstance(dataset, NuScenes | NuScenesPart)
+        assert isinstance(dataset, NuScenes | HeldScene)
         write_tracking_results(output, scenes, dataset.meta)
 
     def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes, part: str = "") -> None:
@@ -241,7 +237,7 @@ class NuScenesSource(DatasetSource):
     @contextmanager
     def parts(self) -> Iterator[Parts]:
         with self.open() as dataset:
-            parts = (NuScenesPart(dataset.scene(name), dataset.meta) for name in dataset.scenes)
+            parts = (HeldScene(dataset.scene(name), dataset.meta) for name in dataset.scenes)
             yield Parts(dataset.scenes, parts, dataset)
 
     def surroundings(self, scenes: Mapping[str, Scene]) -> Surroundings:
@@ -277,18 +273,6 @@ class NuScenesSource(DatasetSource):
         if self.split is not None:
             return split_scenes(root, self.version, self.split)
         return names("--scenes", self.scenes or "")
-
-
-@dataclass(frozen=True, eq=False)
-class NuScenesPart(HeldScene):
-    """A scene in memory, and what its detections rest on."""
-
-    meta: ResultMeta
-
-    @contextmanager
-    def opened(self) -> Iterator[OpenedPart]:
-        digests = {**scene_digests(self.held), "meta": sha256(repr(self.meta).encode()).hexdigest()}
-        yield OpenedPart(digests, lambda: self)
 
 
 def sensor_locations(values: Sequence[str]) -> dict[str, str]:
