@@ -19,7 +19,7 @@ from benchmarks.gap_runs import LivedRun, judged_run, judgement
 from benchmarks.recording_sets import RecordingSet
 from benchmarks.situations import colours_at
 from data_tools.figures import COLOURS, png
-from data_tools.files.atomic_files import write_bytes
+from data_tools.files.file_access import write_bytes
 from pipelines.learning.gaps import CAP, Contender, JudgedRun
 from saga_fg.errors import InputError
 from saga_fg.learning.labelled_scene import Gap, LabelledScene

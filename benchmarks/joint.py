@@ -53,8 +53,7 @@ from saga_fg.slam.joint.record import KEYFRAME_PERIOD, in_ego
 from saga_fg.slam.mapping import LandmarkObservations
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.dataset import Annotations, Scene
-from saga_fg.types.frame import Detections, Frame
-from saga_fg.types.landmark import Observation
+from saga_fg.types.frame import Detections, Frame, Observation
 
 SENSOR = "lidar"
 NEAR, SETTLED, MOVING = 2.0, 3, 1.0  # m, of a detection from the object that it is of; frames; m/s

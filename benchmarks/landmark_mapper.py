@@ -43,7 +43,7 @@ from saga_fg.slam.mapping import (
 )
 from saga_fg.slam.mapping.local_map import POSE
 from saga_fg.slam.mapping.mapper import observation_factors
-from saga_fg.types.landmark import Landmark, LandmarkType, Observation
+from saga_fg.types.frame import Landmark, LandmarkType, Observation
 
 _MERGE_GATE = 1 - 1e-6  # gate probability of merging duplicates; near 1, since an outlier starts a duplicate
 _THRESHOLD = 1.0  # standard deviations that a variable moves before its factors are linearised anew

@@ -27,7 +27,7 @@ import gtsam
 import numpy as np
 
 from data_tools.datasets.mcap.ros2_types import definition, header
-from data_tools.files.atomic_files import write_text
+from data_tools.files.file_access import write_text
 from data_tools.laser import LaserLog
 from data_tools.lidar import Scan, constant_velocity
 from data_tools.lidar.scan import ScanSequence

@@ -46,7 +46,7 @@ from saga_fg.errors import InputError, MissingExtraError
 from saga_fg.model.landmarks import PointLandmark
 from saga_fg.numerics.arrays import BoolArray, FloatArray
 from saga_fg.numerics.geometry import inverse_transform
-from saga_fg.types.landmark import Observation
+from saga_fg.types.frame import Observation
 
 OURS, KISS = "saga-fg", "kiss-icp"
 SETTINGS = OdometrySettings()

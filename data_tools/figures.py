@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.files.atomic_files import write_text
+from data_tools.files.file_access import write_text
 from saga_fg.numerics.arrays import FloatArray
 
 

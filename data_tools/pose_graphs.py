@@ -32,7 +32,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.files.atomic_files import write_text
+from data_tools.files.file_access import write_text
 from data_tools.files.readers import LARGEST, TextTable, read_lines
 from saga_fg.errors import InputError, unknown_name
 from saga_fg.numerics import geometry

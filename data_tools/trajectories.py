@@ -45,7 +45,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from data_tools.files.atomic_files import write_text
+from data_tools.files.file_access import write_text
 from data_tools.files.readers import read_table
 from saga_fg.errors import InputError, error_context
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked

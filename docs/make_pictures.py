@@ -22,7 +22,7 @@ from slam_loops_picture import write_loops_picture
 from benchmarks.joint import degraded_drive, street
 from benchmarks.scans import SimulatedScans, laser_drive
 from data_tools.figures import paths_from_above, png
-from data_tools.files.atomic_files import write_bytes
+from data_tools.files.file_access import write_bytes
 from data_tools.simulator import simulate_scene
 from pipelines.config import load_config
 from pipelines.demo import run_demo

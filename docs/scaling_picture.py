@@ -8,7 +8,7 @@ from typing import Any
 
 from benchmarks.scaling import scaling
 from data_tools.figures import png
-from data_tools.files.atomic_files import write_bytes
+from data_tools.files.file_access import write_bytes
 
 
 def write_scaling_picture(path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.loops import drive_course
 from data_tools.figures import paths_from_above, png
-from data_tools.files.atomic_files import write_bytes
+from data_tools.files.file_access import write_bytes
 
 SEED, DRIFT = 1, 30.0  # m
 

@@ -22,7 +22,7 @@ from saga_fg.tables.conventions import Sample, findings_of
 from saga_fg.tables.plausibility import idle_lanes, idle_rules, settings_without_data
 from saga_fg.tracking.by_name import estimator_parameters
 from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.finding import Finding, Mend, refuse_contradictions
+from saga_fg.types.dataset import Finding, Mend, refuse_contradictions
 from saga_fg.types.road_map import LANE, MAP_CLASSES, STOP_LINE
 
 log = logging.getLogger(__name__)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.figures import FigureTable, cell
-from data_tools.files.atomic_files import atomic_directory, write_text
+from data_tools.files.file_access import atomic_directory, write_text
 from data_tools.metrics import SceneMetrics, scene_metrics
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from data_tools.simulator.source import write_tables

@@ -15,7 +15,7 @@ from data_tools.datasets.results import SceneResult, scene_result
 from data_tools.datasets.source import DatasetSource
 from data_tools.evaluation import placed_detections
 from data_tools.figures import FigureTable, cell, write_figures
-from data_tools.files.atomic_files import write_text
+from data_tools.files.file_access import write_text
 from data_tools.metrics import SceneBoxes, coverages
 from data_tools.metrics.labels import (
     CommonBoxes,

@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from data_tools.figures import FigureTable, count
-from data_tools.files.atomic_files import atomic_file
-from data_tools.files.input_files import open_bytes
+from data_tools.files.file_access import atomic_file, open_bytes
 from data_tools.files.readers import parsed_json
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import OnlineTracker

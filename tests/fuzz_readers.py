@@ -25,7 +25,7 @@ from contextlib import suppress
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the folders beside this script are named as the packages are
-from data_tools.files.atomic_files import write_text
+from data_tools.files.file_access import write_text
 from saga_fg import InputError
 from tests.data_tools.damage import Target, another, targets
 

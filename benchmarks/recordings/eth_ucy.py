@@ -25,7 +25,7 @@ import numpy as np
 from data_tools.datasets.annotated import AnnotatedSource
 from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.source import option
-from data_tools.files.input_files import local_tree
+from data_tools.files.file_access import local_tree
 from data_tools.files.readers import read_table
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import IntArray

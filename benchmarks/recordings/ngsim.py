@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks.recordings.lanelets import road_of
 from benchmarks.recordings.traffic import RecordedTraffic, Recordings, on_grid
-from data_tools.files.input_files import read_bytes
+from data_tools.files.file_access import read_bytes
 from data_tools.files.readers import TextTable
 from saga_fg.errors import InputError
 from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE, MAX_SPEED

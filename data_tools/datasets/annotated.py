@@ -11,7 +11,7 @@ import numpy as np
 
 from data_tools.datasets.detection_files import read_detections
 from data_tools.datasets.source import ChosenScenes, DatasetSource, option
-from data_tools.files.input_files import local_copy
+from data_tools.files.file_access import local_copy
 from saga_fg.errors import InputError
 from saga_fg.tables.detections import DetectionTable
 from saga_fg.types.dataset import Dataset, Scene

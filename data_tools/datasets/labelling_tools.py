@@ -27,7 +27,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from data_tools.datasets.results import SceneResult
-from data_tools.files.input_files import read_text
+from data_tools.files.file_access import read_text
 from data_tools.files.isolated_reading import isolated
 from data_tools.files.readers import parsed_json
 from data_tools.metrics import SceneBoxes

@@ -35,8 +35,7 @@ from data_tools.datasets.source import (
     TrackedScenes,
     option,
 )
-from data_tools.files.atomic_files import atomic_directory, write_text
-from data_tools.files.input_files import read_text
+from data_tools.files.file_access import atomic_directory, read_text, write_text
 from data_tools.metrics import SceneBoxes
 from data_tools.metrics.hota import SceneSimilarities, image_overlaps, similarity_metrics
 from saga_fg.errors import InputError, error_context

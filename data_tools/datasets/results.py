@@ -15,8 +15,7 @@ from data_tools.metrics import SceneBoxes
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.tables.plausibility import usual_class
-from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.finding import Mend
+from saga_fg.types.dataset import Dataset, Mend, Scene
 from saga_fg.types.track import known_velocities
 
 if TYPE_CHECKING:

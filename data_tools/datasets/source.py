@@ -38,7 +38,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
 import numpy as np
 
-from data_tools.files.input_files import open_bytes
+from data_tools.files.file_access import open_bytes
 from saga_fg.errors import InputError, unknown_name
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.parts import find, names_of, part_kind
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from data_tools.datasets.results import Results
     from data_tools.lidar.scan import ScanSequence
     from saga_fg.smoothing import Labels
-    from saga_fg.types.finding import Mend
+    from saga_fg.types.dataset import Mend
     from saga_fg.types.track import Tracks
 
 Verb = Literal[

@@ -21,7 +21,7 @@ from typing import Any, BinaryIO, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from data_tools.files.input_files import open_bytes, open_text, read_text
+from data_tools.files.file_access import open_bytes, open_text, read_text
 from data_tools.files.isolated_reading import isolated
 from saga_fg.errors import InputError, MissingExtraError, error_context
 from saga_fg.numerics.arrays import FloatArray

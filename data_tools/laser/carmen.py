@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.files.input_files import read_text
+from data_tools.files.file_access import read_text
 from data_tools.files.isolated_reading import isolated
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray

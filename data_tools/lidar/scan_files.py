@@ -40,8 +40,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from data_tools.files.atomic_files import write_bytes
-from data_tools.files.input_files import open_bytes, read_bytes
+from data_tools.files.file_access import open_bytes, read_bytes, write_bytes
 from data_tools.files.isolated_reading import isolated
 from data_tools.files.readers import load_archive, load_array
 from data_tools.lidar.scan import Scan, load_open3d

@@ -15,7 +15,7 @@ from data_tools.datasets import import_options
 from data_tools.datasets.detection_files import TableImport
 from data_tools.datasets.detection_files.dataset import TableSurvey, survey_table
 from data_tools.figures import write_figures
-from data_tools.files.atomic_files import check_writable
+from data_tools.files.file_access import check_writable
 from pipelines.cli.console import JsonFile, counted
 from pipelines.cli.options import Verbose
 from pipelines.config import load_config
@@ -25,7 +25,7 @@ from saga_fg.errors import error_context
 from saga_fg.model.edge_rules import acting_classes
 from saga_fg.tables.column_names import pairs
 from saga_fg.tables.plausibility import idle_rules, usual_classes
-from saga_fg.types.finding import FILL_IN, Finding, Mend
+from saga_fg.types.dataset import FILL_IN, Finding, Mend
 
 MOST = 12  # scenes and classes that are listed
 EPOCH = 1e8  # s, from which times count from 1970

@@ -15,7 +15,7 @@ import typer
 
 from data_tools.datasets.detection_file_source import DetectionFileSource
 from data_tools.datasets.source import DatasetSource, Verb, dataset_names, dataset_source
-from data_tools.files.atomic_files import check_writable, write_text
+from data_tools.files.file_access import check_writable, write_text
 from pipelines.cli.console import ReportingGroup, new_command, new_group, set_up_logging
 from pipelines.config import Method, TrackConfig, load_config, load_interactions
 from pipelines.configuration import load_settings

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from data_tools.datasets.source import DatasetSource, input_files
-from data_tools.files.atomic_files import check_writable, write_text
+from data_tools.files.file_access import check_writable, write_text
 from pipelines import view
 from pipelines.cli import options
 from pipelines.cli.console import working

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from data_tools.files.atomic_files import check_writable, write_text
+from data_tools.files.file_access import check_writable, write_text
 from pipelines.cli.console import counted, working
 from pipelines.cli.options import Verbose
 from pipelines.review import (

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 import typer
 
-from data_tools.files.atomic_files import check_writable_folder
+from data_tools.files.file_access import check_writable_folder
 from data_tools.laser import read_carmen
 from data_tools.pose_graphs import read_g2o
 from data_tools.recordings import RecordingOptions, is_bag, read_bag_laser

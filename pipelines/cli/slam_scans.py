@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 import typer
 
-from data_tools.files.atomic_files import check_writable_folder
+from data_tools.files.file_access import check_writable_folder
 from data_tools.lidar.recording import PERIOD
 from data_tools.lidar.scan import ScanSequence
 from data_tools.recordings import LAYOUTS, RecordingOptions, ScanRecording, open_recording

@@ -21,7 +21,7 @@ TERMINATED = 128 + signal.SIGTERM  # exit code, as shells have it
 _AGAIN = 0.02  # s, until it is tried again
 _UNINTERRUPTED = frozenset(
     {
-        "data_tools.files.atomic_files",
+        "data_tools.files.file_access",
         "importlib._bootstrap",
         "multiprocessing.process",
         "multiprocessing.util",

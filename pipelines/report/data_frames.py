@@ -9,7 +9,7 @@ from pathlib import Path
 
 from data_tools.datasets.data_frames import found_results
 from data_tools.datasets.results import Results, clear_figures
-from data_tools.files.atomic_files import write_text
+from data_tools.files.file_access import write_text
 from pipelines.config import load_config
 from pipelines.report.page import Report, report_page, result_figures
 from pipelines.report.scenes import ReportScene

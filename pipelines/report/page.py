@@ -27,8 +27,7 @@ from data_tools.datasets.detection_files import read_predictions
 from data_tools.datasets.results import Results
 from data_tools.datasets.source import DatasetSource
 from data_tools.figures import Chart, FigureTable, as_json
-from data_tools.files.atomic_files import write_text
-from data_tools.files.input_files import read_bytes
+from data_tools.files.file_access import read_bytes, write_text
 from data_tools.files.readers import parsed_json
 from pipelines.config import load_config
 from pipelines.explaining import clock_table

@@ -12,8 +12,7 @@ import numpy as np
 from data_tools.datasets.edits import Edits
 from data_tools.datasets.labelling_tools import exchanged, read_from_tool, tool_format, write_for_tool
 from data_tools.datasets.nuscenes.tables import DETECTION_CLASSES
-from data_tools.files.atomic_files import atomic_directory, write_text
-from data_tools.files.input_files import read_text
+from data_tools.files.file_access import atomic_directory, read_text, write_text
 from data_tools.files.readers import parsed_json
 from data_tools.lidar import write_cloud
 from data_tools.lidar.scan import ScanSequence

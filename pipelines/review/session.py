@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.corrections import check_classes, corrections_of_lines
-from data_tools.files.atomic_files import check_writable, write_text
-from data_tools.files.input_files import open_text, read_text
+from data_tools.files.file_access import check_writable, open_text, read_text, write_text
 from data_tools.files.readers import parsed_json
 from data_tools.metrics import SceneBoxes
 from pipelines.report import Report, ReportScene, report_page

@@ -40,7 +40,7 @@ from data_tools.datasets.corrections import write_outcomes
 from data_tools.datasets.detection_files import write_label_table, write_review
 from data_tools.datasets.given_tracks import TrackedRecordings
 from data_tools.datasets.source import DatasetSource, Part, part_suffix
-from data_tools.files.atomic_files import remove_leftovers, write_bytes
+from data_tools.files.file_access import remove_leftovers, write_bytes
 from data_tools.files.readers import parsed_json
 from pipelines.config import Method, TrackConfig
 from pipelines.configuration import write_settings

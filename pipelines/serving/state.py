@@ -40,7 +40,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from data_tools.files.atomic_files import atomic_file, check_writable, remove_leftovers
+from data_tools.files.file_access import atomic_file, check_writable, remove_leftovers
 from pipelines.serving.settings import LogLimit
 from pipelines.serving.stream import StreamTracker
 from saga_fg.errors import InputError

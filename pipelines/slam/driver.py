@@ -49,8 +49,16 @@ from saga_fg.slam.pose_graph import PoseGraph, PosePriors
 from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.frame import Detections, EgoMeasurements, Frame, GpsFix, ImuSamples, WheelSpeed
-from saga_fg.types.landmark import Landmark, Observation
+from saga_fg.types.frame import (
+    Detections,
+    EgoMeasurements,
+    Frame,
+    GpsFix,
+    ImuSamples,
+    Landmark,
+    Observation,
+    WheelSpeed,
+)
 
 START = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2  # of the first pose, which is where the world begins
 

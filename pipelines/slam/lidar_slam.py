@@ -45,8 +45,7 @@ from saga_fg.slam.mapping import LandmarkObservations
 from saga_fg.slam.sensors import sensor_providers
 from saga_fg.slam.submaps import Loops, SubmapSettings
 from saga_fg.tracking import Tracker
-from saga_fg.types.frame import Frame
-from saga_fg.types.landmark import Observation
+from saga_fg.types.frame import Frame, Observation
 
 WALL = PlaneLandmark(name="wall")
 POLE = PoleLandmark()

@@ -54,7 +54,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.figures import occupancy_picture, paths_from_above, png, scan_map_from_above, write_figures
-from data_tools.files.atomic_files import atomic_directory, write_bytes, write_text
+from data_tools.files.file_access import atomic_directory, write_bytes, write_text
 from data_tools.laser import LaserLog, OccupancyGrid
 from data_tools.lidar import write_cloud
 from data_tools.lidar.scan import ScanSequence
@@ -69,7 +69,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import in_space, inverse_transform, transform_points, transforms
 from saga_fg.slam.joint import JointEstimate
 from saga_fg.slam.pose_graph import OptimisedPoses, PoseGraph
-from saga_fg.types.landmark import Landmark
+from saga_fg.types.frame import Landmark
 
 _CONFIRMED = 5  # detections
 

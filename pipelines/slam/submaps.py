@@ -26,7 +26,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from data_tools.files.atomic_files import write_text
+from data_tools.files.file_access import write_text
 from data_tools.files.readers import TextTable, read_lines
 from data_tools.lidar import (
     RegistrationError,

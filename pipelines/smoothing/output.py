@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 from data_tools.datasets.corrections import write_outcomes
 from data_tools.datasets.detection_files import write_label_table, write_review
 from data_tools.figures import write_figures
-from data_tools.files.atomic_files import atomic_directory
+from data_tools.files.file_access import atomic_directory
 from pipelines.report.page import RunRecord, write_run_record
 from pipelines.smoothing.streaming import SmoothedScene
 from saga_fg.smoothing import LabelCounts, Labels

@@ -47,7 +47,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.source import DatasetSource
-from data_tools.files.input_files import read_bytes
+from data_tools.files.file_access import read_bytes
 from data_tools.files.readers import parsed_json
 from data_tools.lidar import read_scan, voxel_downsample
 from data_tools.lidar.scan import ScanSequence

@@ -23,7 +23,7 @@ from typing import Any, assert_never
 
 import numpy as np
 
-from data_tools.files.atomic_files import atomic_file, check_writable
+from data_tools.files.file_access import atomic_file, check_writable
 from pipelines.view.scenes import Arrows, Drawing, Lines, Points, Pose, Shape, Solids
 from saga_fg.errors import InputError, MissingExtraError
 from saga_fg.numerics.arrays import FloatArray, IntArray

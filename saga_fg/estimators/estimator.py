@@ -29,9 +29,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError, require_type
-from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.measurements import Measurements, Observations
 from saga_fg.estimators.object_factors import prior_graph
+from saga_fg.estimators.partition import BlockGaussian
 from saga_fg.graph.providers import FactorProvider
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.kernels.components import planar_marginals

@@ -26,9 +26,8 @@ from typing import NamedTuple
 import numpy as np
 
 from saga_fg.errors import InputError, require_type
-from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.measurements import LinearisedMeasurements
-from saga_fg.estimators.partition import Partition, StateLayout, unflattened
+from saga_fg.estimators.partition import BlockGaussian, Partition, StateLayout, unflattened
 from saga_fg.kernels.filtering import corrected_state, predicted_state, tie_strengths
 from saga_fg.model.discretisation import Blocks, Transition
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray

@@ -24,7 +24,6 @@ from numpy.typing import ArrayLike
 
 from factors.gaussian import Elimination
 from saga_fg.errors import InputError, UnknownNodeError, require_type
-from saga_fg.estimators.block_gaussian import BlockGaussian, not_smaller
 from saga_fg.estimators.estimator import Estimator
 from saga_fg.estimators.filtering import Dynamics, predict
 from saga_fg.estimators.graph_window import SAME_TIME, GraphState, GraphWindow, WholeGraph, WindowEpoch, whole_graph
@@ -40,7 +39,7 @@ from saga_fg.estimators.interval_dynamics import (
 )
 from saga_fg.estimators.measurements import Measured, Measurements, Observations
 from saga_fg.estimators.object_factors import DetectionFactors, Interactions
-from saga_fg.estimators.partition import StateLayout, checked_prior
+from saga_fg.estimators.partition import BlockGaussian, StateLayout, checked_prior, not_smaller
 from saga_fg.estimators.smoother import SmoothedState
 from saga_fg.graph.providers import FactorProvider, predictors
 from saga_fg.graph.scene_factor_graph import WIDE, SceneFactorGraph
@@ -64,7 +63,7 @@ class GraphFilter(Estimator):
     by covariances; their window begins anew there.
 
     The covariance of nodes that are `unsettled` is not smaller than the one predicted over the last interval, see
-    `saga_fg.estimators.block_gaussian`: what was measured meanwhile counts for their place alone.
+    `saga_fg.estimators.partition`: what was measured meanwhile counts for their place alone.
     """
 
     snapshots_hold_models = True

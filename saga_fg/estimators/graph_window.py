@@ -16,10 +16,9 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
 from saga_fg.estimators.batch import linear_solution
-from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.filtering import Dynamics
 from saga_fg.estimators.independent import IndependentObjects
-from saga_fg.estimators.partition import Partition, StateLayout
+from saga_fg.estimators.partition import BlockGaussian, Partition, StateLayout
 from saga_fg.estimators.smoother import SmoothedState
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import node_key

@@ -24,10 +24,9 @@ import numpy as np
 from factors.gaussian import Elimination
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.batch import GraphSolution
-from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.interval_dynamics import joint_gaussian
 from saga_fg.estimators.isam2_engine import Engine, RelinearisationSettings
-from saga_fg.estimators.partition import StateLayout
+from saga_fg.estimators.partition import BlockGaussian, StateLayout
 from saga_fg.graph.providers import FactorProvider, GraphView, OtherVariables, ask, predictors
 from saga_fg.graph.scene_factor_graph import Condensation, SceneFactorGraph
 from saga_fg.graph.variables import GraphError, LinearisationPoint

@@ -19,12 +19,11 @@ from functools import cached_property
 import numpy as np
 
 from factors import GaussianFactors, Vector, gaussian_factors
-from saga_fg.estimators.block_gaussian import UNCORRELATED, BlockGaussian
 from saga_fg.estimators.filtering import Dynamics, corrected, noise_ratio, predict
 from saga_fg.estimators.interval_dynamics import LARGEST_RATIO, merged
 from saga_fg.estimators.measurements import Measurements
 from saga_fg.estimators.object_factors import component_priors, measurement_factors
-from saga_fg.estimators.partition import StateLayout
+from saga_fg.estimators.partition import UNCORRELATED, BlockGaussian, StateLayout
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import GraphVariable, NewVariable, VariableKind, node_key, node_kind
 from saga_fg.numerics.arrays import FloatArray, IntArray

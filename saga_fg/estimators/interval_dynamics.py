@@ -34,9 +34,8 @@ from factors import FactorError, ResidualFactors, joint_prior_factor
 from factors.gaussian import Elimination
 from factors.validation import KeyArray
 from saga_fg.errors import InputError
-from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.filtering import Dynamics, noise_ratio, predict
-from saga_fg.estimators.partition import Partition, StateLayout, zeros
+from saga_fg.estimators.partition import BlockGaussian, Partition, StateLayout, zeros
 from saga_fg.graph.factor_checks import solver_error, with_names
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.model.discretisation import Blocks, Transition, discretise

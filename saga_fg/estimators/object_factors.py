@@ -29,10 +29,9 @@ from factors import (
     prior_factors,
 )
 from saga_fg.errors import InputError
-from saga_fg.estimators.block_gaussian import BlockGaussian
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.measurements import Measured, Measurements, Observations
-from saga_fg.estimators.partition import StateLayout
+from saga_fg.estimators.partition import BlockGaussian, StateLayout
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import NewVariable, node_key, node_kind

@@ -34,8 +34,7 @@ from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.parts import part_kind
 from saga_fg.settings import Positive, Settings, setting
-from saga_fg.types.frame import Frame
-from saga_fg.types.landmark import Observation
+from saga_fg.types.frame import Frame, Observation
 
 
 @part_kind("detector of landmarks", "saga_fg.landmarks")

@@ -27,7 +27,7 @@ from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import feet, on_it
 from saga_fg.providers.odometry import NO_POSE
 from saga_fg.settings import Positive, Settings, setting, settings_group
-from saga_fg.types.landmark import Observation
+from saga_fg.types.frame import Observation
 from saga_fg.types.road_map import Lane
 
 ALONG = 0.9  # cosine of the angle between a course and a lane within which an object goes along it

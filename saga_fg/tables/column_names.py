@@ -23,7 +23,7 @@ import numpy as np
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.settings import Settings, setting, settings_group
-from saga_fg.types.finding import FILL_IN, Finding, Mend
+from saga_fg.types.dataset import FILL_IN, Finding, Mend
 
 Kind = Literal["time", "length", "speed", "angle", "score"]
 FACTORS: Mapping[Kind, Mapping[str, float]] = {

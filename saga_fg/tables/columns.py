@@ -26,7 +26,7 @@ from saga_fg.tables.column_names import (
 )
 from saga_fg.tables.plausibility import days_taken_for_times, frames_taken_for_seconds
 from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE, MAX_SPEED
-from saga_fg.types.finding import FILL_IN, Finding
+from saga_fg.types.dataset import FILL_IN, Finding
 from saga_fg.types.frame import LATEST, EgoMeasurements, GpsFix, OdometryIncrement
 
 REQUIRED = ("timestamp", "x", "y")

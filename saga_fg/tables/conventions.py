@@ -29,7 +29,7 @@ from saga_fg.tables.plausibility import (
     within_a_metre,
 )
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.finding import Finding, Mend
+from saga_fg.types.dataset import Finding, Mend
 from saga_fg.types.frame import Frame
 
 MAX_FRAMES = 200

@@ -31,8 +31,7 @@ from saga_fg.tables.columns import (
 )
 from saga_fg.tables.conventions import Sample, findings_of
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Scene
-from saga_fg.types.finding import Finding, Mend, refuse_contradictions
+from saga_fg.types.dataset import Finding, Mend, Scene, refuse_contradictions
 from saga_fg.types.frame import Coordinates, Detections, Frame
 
 _COORDINATES = ("world", "ego", "sensor", "camera")

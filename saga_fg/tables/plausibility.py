@@ -12,7 +12,7 @@ from difflib import get_close_matches
 import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.types.finding import FILL_IN, Finding, Mend
+from saga_fg.types.dataset import FILL_IN, Finding, Mend
 
 _WORDS = {
     "pedestrian": "pedestrian pedestrians person people human walker adult child",

@@ -10,7 +10,7 @@ from saga_fg import InputError
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.tables.column_names import TableImport
 from saga_fg.tables.detections import raw_table, scenes_of
-from saga_fg.types.finding import refuse_contradictions
+from saga_fg.types.dataset import refuse_contradictions
 
 MENDS = {
     "vehicle's frame as world": "--coordinates ego",

@@ -13,7 +13,7 @@ from saga_fg import InputError
 from saga_fg.model.landmarks import LineLandmark, PlaneLandmark, PointLandmark, PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.mapping import LocalMap
-from saga_fg.types.landmark import Observation
+from saga_fg.types.frame import Observation
 
 TREE, R = PointLandmark(density=0.01), 0.05**2 * np.eye(2)
 Q = np.diag([0.02, 0.02, 0.002]) ** 2

@@ -335,7 +335,7 @@ MOMENTS = {
 SCRIPT = """
 import logging, os, pathlib, pkgutil, shutil, signal, sys, tempfile, time, weakref
 import numpy as np
-from data_tools.files.atomic_files import atomic_directory, write_text
+from data_tools.files.file_access import atomic_directory, write_text
 from pipelines.cli.termination import Terminated, ignore_sigterm, raise_on_sigterm
 from pipelines.scale_out import OutputFolder
 from saga_fg.numerics.arrays import distinct

@@ -16,8 +16,7 @@ from pipelines.slam.vehicle_sensors import BetweenKeyframes, Vehicle
 from saga_fg.errors import InputError
 from saga_fg.graph import Additions, GraphView
 from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.types.frame import Detections, EgoMeasurements, GpsFix, WheelSpeed
-from saga_fg.types.landmark import Observation
+from saga_fg.types.frame import Detections, EgoMeasurements, GpsFix, Observation, WheelSpeed
 
 NOTHING = Scan.of(np.empty((0, 3)))
 PLAIN = LidarSlamSettings(landmarks=False, loop_closures=False)

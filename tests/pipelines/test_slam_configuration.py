@@ -20,7 +20,7 @@ import gtsam
 import numpy as np
 
 from saga_fg.graph import EGO_POSE, Additions
-from saga_fg.types.landmark import Observation
+from saga_fg.types.frame import Observation
 from saga_fg.model.landmarks import PoleLandmark
 
 

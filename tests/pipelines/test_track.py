@@ -14,7 +14,7 @@ from data_tools.datasets.kitti import local_kitti
 from data_tools.datasets.kitti.source import KittiSource
 from data_tools.datasets.nuscenes import NuScenes, read_tracking_results
 from data_tools.datasets.source import SourcePart
-from data_tools.files.input_files import local_tree
+from data_tools.files.file_access import local_tree
 from data_tools.simulator import SimulatorSettings
 from pipelines.checks import Checks
 from pipelines.config import Family, TrackConfig, load_config

@@ -44,7 +44,7 @@ import numpy as np
 from data_tools.datasets.annotated import DetectedScenes
 from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.source import AreaMap, Kind, map_points
-from data_tools.files.input_files import read_bytes
+from data_tools.files.file_access import read_bytes
 from data_tools.files.readers import WHOLE, arrow_arrays, parsed_json
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, checked

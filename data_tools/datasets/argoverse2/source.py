@@ -44,8 +44,7 @@ from data_tools.datasets.argoverse2.logs import (
 from data_tools.datasets.detection_files import TrackRows, read_detections
 from data_tools.datasets.results import Results, scene_result
 from data_tools.datasets.source import ChosenScenes, ResultFormat, Surroundings, TrackedScenes, option
-from data_tools.files.atomic_files import atomic_file
-from data_tools.files.input_files import is_url, local_copy, local_tree
+from data_tools.files.file_access import atomic_file, is_url, local_copy, local_tree
 from data_tools.files.readers import arrow_arrays
 from saga_fg.errors import InputError, error_context
 from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray

@@ -28,8 +28,7 @@ from saga_fg.tables.columns import (
 )
 from saga_fg.tables.detections import DetectionTable, sorted_by_time
 from saga_fg.tracking.dense_traffic import seems_dense_traffic
-from saga_fg.types.dataset import Scene
-from saga_fg.types.finding import Finding
+from saga_fg.types.dataset import Finding, Scene
 
 
 def read_detections(path: str | Path, how: TableImport | None = None) -> DetectionTable:

@@ -14,7 +14,7 @@ from typing import Any, TextIO, TypeVar
 
 import numpy as np
 
-from data_tools.files.input_files import open_bytes, open_text
+from data_tools.files.file_access import open_bytes, open_text
 from data_tools.files.readers import SUFFIXES, arrow_columns, arrow_names, load_archive, parsed_json
 from saga_fg.errors import InputError
 from saga_fg.tables.column_names import Clock, Columns, TableImport, meaning, understood

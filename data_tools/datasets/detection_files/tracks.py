@@ -39,8 +39,7 @@ import numpy as np
 
 from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.detection_files.formats import Layout, read_raw_table
-from data_tools.files.atomic_files import atomic_file
-from data_tools.files.input_files import open_bytes
+from data_tools.files.file_access import atomic_file, open_bytes
 from saga_fg.errors import InputError, MissingExtraError, error_context, unknown_name
 from saga_fg.numerics.arrays import (
     BoolArray,
@@ -66,8 +65,7 @@ from saga_fg.tables.columns import (
 from saga_fg.tables.conventions import Sample, findings_of
 from saga_fg.tables.detections import box_columns
 from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations, Scene
-from saga_fg.types.finding import Finding, refuse_contradictions
+from saga_fg.types.dataset import Annotations, Finding, Scene, refuse_contradictions
 from saga_fg.types.track import PredictedTracks, Tracks
 
 if TYPE_CHECKING:

@@ -57,7 +57,7 @@ from data_tools.datasets.kitti.labels import (
     read_kitti_labels,
 )
 from data_tools.datasets.source import Images
-from data_tools.files.input_files import local_tree
+from data_tools.files.file_access import local_tree
 from data_tools.files.readers import TextTable, read_lines, read_table
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
 from data_tools.lidar import Scan, azimuth_times

@@ -65,8 +65,7 @@ from data_tools.datasets.source import (
 )
 from data_tools.evaluation import Evaluation, HotaRow, mean_scores, placed_detections
 from data_tools.figures import FigureTable, cell
-from data_tools.files.atomic_files import atomic_directory
-from data_tools.files.input_files import is_url
+from data_tools.files.file_access import atomic_directory, is_url
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box, world_boxes_to_camera
 from data_tools.metrics import (
     KittiSimilarity,

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from data_tools.datasets.mcap.ros2_types import definition, plain_type
-from data_tools.files.input_files import open_bytes
+from data_tools.files.file_access import open_bytes
 from data_tools.files.isolated_reading import isolated, one_line
 from saga_fg.errors import InputError, MissingExtraError, unknown_name
 

@@ -33,7 +33,7 @@ from data_tools.datasets.source import (
     file_digest,
     option,
 )
-from data_tools.files.atomic_files import atomic_file
+from data_tools.files.file_access import atomic_file
 from saga_fg.errors import InputError, error_context
 from saga_fg.tables.column_names import pairs
 from saga_fg.types.boxes import Boxes

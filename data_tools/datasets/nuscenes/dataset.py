@@ -39,7 +39,7 @@ from data_tools.datasets.nuscenes.tables import (
     table_folder,
 )
 from data_tools.datasets.source import AreaMap, Images, Kind, map_points
-from data_tools.files.input_files import read_bytes
+from data_tools.files.file_access import read_bytes
 from data_tools.files.readers import parsed_json
 from data_tools.lidar.recording import ScanRecording
 from data_tools.lidar.scan_files import NUSCENES, read_records

@@ -37,7 +37,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from data_tools.datasets.nuscenes.tables import DETECTION_CLASSES, TRACKING_CLASSES
-from data_tools.files.atomic_files import atomic_file
+from data_tools.files.file_access import atomic_file
 from data_tools.files.readers import JsonStream, open_json
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import Columns, FloatArray, StrArray, from_upper_triangle, upper_triangle

@@ -43,7 +43,7 @@ from data_tools.evaluation import (
     placed_detections,
     sweep_table,
 )
-from data_tools.files.input_files import is_url, local_copy, local_tree
+from data_tools.files.file_access import is_url, local_copy, local_tree
 from data_tools.metrics import (
     LabelErrors,
     NuScenesTrackingMetrics,

@@ -55,8 +55,7 @@ from data_tools.datasets.nuscenes.tables import (
     table_folder,
     token,
 )
-from data_tools.files.atomic_files import atomic_directory, atomic_file, write_text
-from data_tools.files.input_files import open_bytes
+from data_tools.files.file_access import atomic_directory, atomic_file, open_bytes, write_text
 from data_tools.files.readers import open_json, parsed_json
 from saga_fg.errors import InputError, error_context
 from saga_fg.numerics.arrays import FloatArray, IntArray, upper_triangle

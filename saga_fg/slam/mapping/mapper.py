@@ -21,7 +21,7 @@ from saga_fg.estimators.batch import GraphSolution
 from saga_fg.graph import EGO_POSE, LANDMARK, Additions, GraphView, NewVariable, key_of
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.types.landmark import Landmark, LandmarkType, Observation
+from saga_fg.types.frame import Landmark, LandmarkType, Observation
 
 
 def pose_key(epoch: int) -> int:

@@ -51,8 +51,7 @@ from saga_fg.slam.mapping import (
 )
 from saga_fg.slam.submaps.condensing import CondensedSubmap
 from saga_fg.slam.submaps.loops import LoopClosure, Loops, LoopSelection, Motion, loop_factors, select_loops
-from saga_fg.types.frame import Frame
-from saga_fg.types.landmark import Landmark, Observation
+from saga_fg.types.frame import Frame, Landmark, Observation
 
 _GAP = 3.0  # m
 _ANCHOR = 1e-12 * np.eye(6)  # covariance of the anchor in its own frame

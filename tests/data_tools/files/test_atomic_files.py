@@ -7,15 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from data_tools.files.atomic_files import (
+from data_tools.files.file_access import (
+    PROTOCOLS,
     atomic_directory,
     atomic_file,
     check_writable,
     check_writable_folder,
+    expanded,
+    local_copy,
+    local_tree,
     remove_leftovers,
     write_text,
 )
-from data_tools.files.input_files import PROTOCOLS, expanded, local_copy, local_tree
 from saga_fg.errors import InputError, MissingExtraError
 
 

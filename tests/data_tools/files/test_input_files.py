@@ -14,7 +14,7 @@ from benchmarks.recordings.landmarks import read_landmark_log
 from data_tools.datasets.detection_files import read_detections, read_tracks
 from data_tools.datasets.kitti.labels import read_kitti_labels
 from data_tools.datasets.nuscenes import read_tracking_results
-from data_tools.files.input_files import open_bytes, read_text
+from data_tools.files.file_access import open_bytes, read_text
 from data_tools.files.readers import open_json, parsed_json
 from data_tools.lidar import read_scan
 from data_tools.pose_graphs import read_g2o

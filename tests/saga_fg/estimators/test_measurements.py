@@ -6,8 +6,7 @@ import pytest
 from factors import Bearing, Radar, Range, RangeBearing, RangeRate
 from saga_fg import ConstantVelocity, InputError, NodeType, SagaError, SceneGraph
 from saga_fg.estimators import BatchSolver, GraphFilter, JointKalmanFilter, Measurements, Observations
-from saga_fg.estimators.block_gaussian import BlockGaussian, missing_covariance, not_smaller
-from saga_fg.estimators.partition import Partition, StateLayout
+from saga_fg.estimators.partition import BlockGaussian, Partition, StateLayout, missing_covariance, not_smaller
 from saga_fg.model.discretisation import discretise
 from saga_fg.numerics.arrays import FloatArray
 from tests.saga_fg.graph_keys import newest_key

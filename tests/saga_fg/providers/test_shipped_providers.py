@@ -22,8 +22,7 @@ from saga_fg.model.sensor import NoiseModel
 from saga_fg.providers import Gps, Imu, Landmarks, LaneKeeping, Odometry, StartSettings
 from saga_fg.providers.navigation import GRAVITY
 from saga_fg.tracking import ClassSettings
-from saga_fg.types.frame import EgoMeasurements, GpsFix, ImuSamples, OdometryIncrement
-from saga_fg.types.landmark import Observation
+from saga_fg.types.frame import EgoMeasurements, GpsFix, ImuSamples, Observation, OdometryIncrement
 from saga_fg.types.road_map import Lane
 
 DT = 0.1

@@ -25,7 +25,7 @@ from saga_fg.slam.joint.record import record_epochs
 from saga_fg.slam.mapping import LandmarkObservations
 from saga_fg.tracking import AssociationSettings, ClassSettings
 from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.landmark import Observation
+from saga_fg.types.frame import Observation
 from tests.saga_fg.ego_drive import NOISE, drive, new_tracker
 
 POOR = OdometryNoise(scale=0.02, bias=0.005)

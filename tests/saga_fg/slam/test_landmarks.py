@@ -16,7 +16,7 @@ from saga_fg.graph import GraphError, SceneFactorGraph, ask_all
 from saga_fg.model.landmarks import LineLandmark, PlaneLandmark, PointLandmark, PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.mapping import LandmarkObservations, LocalMap, MeasuredMotion, associate, landmark_key, pose_key
-from saga_fg.types.landmark import LandmarkType, Observation
+from saga_fg.types.frame import LandmarkType, Observation
 
 KINDS: list[LandmarkType] = [PointLandmark(), PointLandmark(dim=3), PoleLandmark(), PlaneLandmark(), LineLandmark()]
 POLE = np.diag([0.1, 0.1]) ** 2

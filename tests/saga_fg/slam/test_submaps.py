@@ -17,8 +17,7 @@ from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.providers.navigation import Gps
 from saga_fg.slam.mapping import pose_key
 from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph, SubmapSettings
-from saga_fg.types.frame import Detections, EgoMeasurements, Frame, GpsFix
-from saga_fg.types.landmark import Observation
+from saga_fg.types.frame import Detections, EgoMeasurements, Frame, GpsFix, Observation
 
 FIRST = np.diag([1e-4] * 3 + [1e-3] * 3) ** 2
 Q = np.diag([2e-4, 2e-4, 5e-4, 5e-3, 5e-3, 5e-3]) ** 2

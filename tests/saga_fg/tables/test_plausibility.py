@@ -27,7 +27,7 @@ from saga_fg.tables.plausibility import (
     usual_classes,
     within_a_metre,
 )
-from saga_fg.types.finding import Finding, Mend
+from saga_fg.types.dataset import Finding, Mend
 
 RNG = np.random.default_rng(5)
 CARS = np.full(60, "car")
