@@ -14,6 +14,7 @@ NAMES = (
         "estimators",
         "gaps",
         "geometry",
+        "inertial",
         "joint",
         "kills",
         "labels",

@@ -28,6 +28,7 @@ import typer
 from scipy.spatial.transform import Rotation
 
 from benchmarks.bootstrap import paired_bootstrap
+from benchmarks.online_joint import OnlineEstimator
 from benchmarks.runner import Row, Rows, each
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.simulator import SimulatorSettings, simulate_scene
@@ -45,7 +46,6 @@ from saga_fg.slam.joint import (
     JointSettings,
     OdometryIncrements,
     OdometryNoise,
-    OnlineEstimator,
     estimate_jointly,
 )
 from saga_fg.slam.joint.graph import ObjectStates

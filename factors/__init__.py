@@ -33,7 +33,7 @@ from factors.measurement import (
     detection_factors,
 )
 from factors.nonlinear import ResidualFactors, residual_factor
-from factors.relative import HesseLine, line_factors, plane, plane_factor, relative_factors
+from factors.relative import plane, plane_factor, relative_factors
 from factors.robust import Mixture, Robust, RobustLoss
 from factors.solver import Linearisable, Solution, SolverSettings, linearised, solve
 from factors.validation import FactorError, SingularSystemError
@@ -43,7 +43,6 @@ __all__ = [
     "Bearing",
     "FactorError",
     "GaussianFactors",
-    "HesseLine",
     "ImuBias",
     "Linearisable",
     "MeasurementModel",
@@ -74,7 +73,6 @@ __all__ = [
     "interaction_factor",
     "interaction_factors",
     "joint_prior_factor",
-    "line_factors",
     "linearised",
     "marginal_factors",
     "marginal_moments",

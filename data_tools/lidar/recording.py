@@ -1,8 +1,8 @@
 """A recording of LiDAR scans: when and where each was taken, how to read it, and the other sensors of the vehicle.
 
 Every layout gives one; `read` returns the scan of a row. What only the whole of a recording shows is checked here: time
-that runs backwards, a last scan that was cut off, and scans of another sensor among the others. The latter is told by
-the elevations that a sensor sees, from the 2 % to the 98 % quantile: those of one and the same overlap.
+that runs backwards, a last scan that was cut off, and scans of two sensors in turn. The latter are told by how
+far it is in each direction: a scan is more like the one before than like that before it, if one sensor took them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Self
 
 import numpy as np
 
-from data_tools.lidar.scan import Scan, ScanSequence
+from data_tools.lidar.scan import Scan, ScanSequence, cell_order_statistics
 from saga_fg.errors import InputError, error_context
 from saga_fg.numerics.arrays import FloatArray, checked
 from saga_fg.numerics.geometry import checked_transform
@@ -24,8 +24,9 @@ from saga_fg.slam.sensors import SensorName
 from saga_fg.types.frame import Frame
 
 PERIOD = 0.1  # s between scans of which no time is known
-_OVERLAP = 0.3  # of the elevations of scans of one sensor, of those that either sees
-_POINTS = 3000  # of a scan that show its elevations
+_BEARINGS = 36  # directions in which distances are compared
+_UNLIKE = 1.5  # times as far from the scan before as from the one before that: none of a moving sensor, or hardly any
+_WINDOW, _IN_TURN = 20, 6  # scans that are compared, and those so that tell two sensors
 _log = logging.getLogger(__name__)
 
 
@@ -87,7 +88,9 @@ class ScanRecording:
     blind: bool = False
     timed: bool = True
     dropped: dict[int, int] = field(default_factory=dict)
-    _seen: list[FloatArray] = field(default_factory=list)
+    _last: list[int] = field(default_factory=list)  # row that was read
+    _profiles: list[FloatArray] = field(default_factory=list)  # of the rows up to it, one after the other
+    _unlike: list[bool] = field(default_factory=list)  # which are hardly like the one before
 
     def __post_init__(self) -> None:
         if not len(self.timestamps):
@@ -130,23 +133,34 @@ class ScanRecording:
         )
 
     def _compare(self, row: int, scan: Scan) -> None:
-        """Warn once of elevations that hardly overlap with those of the first scan."""
-        if not len(scan) or len(self._seen) > 1:
-            return
-        x, y, z = scan.points[:: len(scan) // _POINTS + 1].T
-        now = np.degrees(np.quantile(np.arctan2(z, np.hypot(x, y)), [0.02, 0.98]))
-        if not self._seen:
-            self._seen.append(now)
-            return
-        first = self._seen[0]
-        both = min(first[1], now[1]) - max(first[0], now[0])
-        if both < _OVERLAP * (max(first[1], now[1]) - min(first[0], now[0])):
-            self._seen.append(now)
-            _log.warning(
-                "%s: its points are at elevations of %.0f to %.0f deg, those of the first scan at %.0f to %.0f: a scan "
-                "of another sensor?",
-                self.place(row), *now, *first,
-            )  # fmt: skip
+        """Raise `InputError` where scans read one after the other are those of two sensors in turn."""
+        if self._last != [row - 1]:
+            self._profiles.clear()
+            self._unlike.clear()
+        self._last[:] = [row]
+        self._profiles.append(_profile(scan.points))
+        if len(self._profiles) > 2:
+            earlier, before, now = self._profiles[-3:]
+            self._unlike.append(_change(before, now) > _UNLIKE * _change(earlier, now))
+        if (count := sum(self._unlike[-_WINDOW:])) >= _IN_TURN:
+            raise InputError(
+                f"{self.place(row)}: expected scans of one sensor: {count} of the last {_WINDOW} are far less like the "
+                "scan before than like the one before that, as those of two sensors in turn"
+            )
+
+
+def _profile(points: FloatArray) -> FloatArray:
+    """Logarithms (`_BEARINGS`,) of the median distance in each direction from above, NaN where there are no points."""
+    bearing = (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5) * _BEARINGS
+    distance = np.log(np.maximum(np.hypot(points[:, 0], points[:, 1]), 0.1))
+    return cell_order_statistics(distance, bearing.astype(np.int64) % _BEARINGS, _BEARINGS, 2)
+
+
+def _change(before: FloatArray, now: FloatArray) -> float:
+    """Mean change of two profiles, 0 where they have no direction in common."""
+    change = np.abs(now - before)
+    known = np.isfinite(change)
+    return float(change[known].mean()) if known.any() else 0.0
 
 
 def scan_context(scans: ScanSequence, row: int) -> AbstractContextManager[None]:

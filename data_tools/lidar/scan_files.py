@@ -447,24 +447,20 @@ _READERS: dict[str, Callable[[Path], Columns]] = {
 SUFFIXES = tuple(_READERS)
 
 
-def write_cloud(path: str | Path, points: FloatArray, colours: NDArray[np.uint8] | None = None) -> None:
-    """Write points (N, 3), m, as float32, and red, green, blue (N, 3) from 0 to 255 if given, atomically.
+def write_cloud(path: str | Path, points: FloatArray) -> None:
+    """Write points (N, 3), m, as float32, atomically.
 
     path: .ply or .pcd
-    Raises `InputError` for another suffix, positions that are not finite, and colours of another shape or type.
+    Raises `InputError` for another suffix, and positions that are not finite.
     """
     points, suffix = checked("points", points, (None, 3)), Path(path).suffix.lower()
     if suffix not in (".ply", ".pcd"):
         raise InputError(f"{path}: expected a name that ends in .ply or .pcd")
-    if colours is not None and (colours.shape != points.shape or colours.dtype != np.uint8):
-        raise InputError(f"colours: expected {points.shape} bytes, got {colours.dtype} {colours.shape}")
     if not len(points) and suffix == ".ply":  # which Open3D refuses
         write_bytes(path, _EMPTY.encode("ascii"))
         return
     open3d = load_open3d()
     cloud = open3d.t.geometry.PointCloud(open3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32)))
-    if colours is not None:
-        cloud.point.colors = open3d.core.Tensor(np.ascontiguousarray(colours))
     with tempfile.TemporaryDirectory() as folder:
         whole = Path(folder) / f"cloud{suffix}"
         if not open3d.t.io.write_point_cloud(str(whole), cloud):

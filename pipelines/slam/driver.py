@@ -248,8 +248,7 @@ class Slam:
         self._new_graph = partial(SubmapGraph, settings=front_end.submaps, providers=both)
         self._graph = self._new_graph(self._start, self._first)
         self._closed = ClosedSubmaps(front_end.loops)
-        registers = getattr(self._odometry, "registers", False)
-        self._builder = SubmapBuilder(front_end.spacing, straighten=not registers)
+        self._builder = SubmapBuilder(front_end.spacing)
         self._path, self._online = Drive(), list[FloatArray]()
         self._degenerate, self._boxes = list[tuple[str, ...]](), list[Boxes]()  # of all scans
         self._finished, self._covariance = False, self._first  # of the last keyframe's pose
@@ -352,6 +351,7 @@ class Slam:
         frame = self._measured.frame(self._path.times[row], detections)
         closes = self._graph.append(self._path.times[row], moved, seen, frame)
         self._measured.clear()
+        self._sensors.begin(self._graph.smoother)
         self._path.keyframes.append(row)
         submap = self._closed.close(self._builder, self._graph, self._graph.poses()[:-1]) if closes else None
         pose = self._graph.pose(len(self._graph) - 1)

@@ -204,8 +204,6 @@ class LaserOdometry:
     wheels: their pose (3, 3) at the next scan, set before `step`; keyframes: so far; scale: of the wheels
     """
 
-    registers = True
-
     def __init__(self, scale: WheelScale | None = None) -> None:
         self.scale, self.keyframes = scale or WheelScale(), list[Keyframe]()
         self.wheels: FloatArray = np.eye(3)

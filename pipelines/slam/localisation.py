@@ -395,6 +395,7 @@ class Localiser:
             self._fitted = self.way
             self._fits.add(row)
         self._smoother.step(time, [*given, *self._of_sensors], self._measured.frame(time, None))
+        self._sensors.begin(self._smoother)
         self.consistency.observe(self._smoother.graph(), s.lag / 2)
         (pose,) = self._smoother.graph().of(EGO_POSE, self._smoother.graph().epoch).values()
         self._pose, self._covariance = (

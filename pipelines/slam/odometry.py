@@ -1,11 +1,14 @@
 """LiDAR odometry: the motion of the sensor scan by scan, and keyframes of a drive.
 
     predict    T- = T_(k-1) exp(dt xi)                        the velocity of the step before, or of other sensors
-    de-skew    by xi, where the points have times
+    de-skew    by xi, where the points have times; by other sensors: xi at the scan, half a step after that of the step
     register   T = point-to-plane ICP of a thinned scan against the surfels of the scans before, from T-
     adapt      e_k = || trans D || + 2 r sin(angle(D) / 2),  D = (T-)^-1 T,  r a typical range
                sigma_k = root mean square of the e so far, not below a floor
     extend     the map, by scans that moved on since the last that did (keyframes)
+
+A scan that overlaps less with the map than scans before it, or lies off its surfels, is lost, or was moved: it is
+looked for around the last scan that fitted, and enters the map only where it fits or after several such scans.
 
 In a tunnel or an open field some motions are left open (`data_tools.lidar.registration`). Along these the pose stays as
 predicted, the step names them, and its covariance is wide there, so that a graph relies on other sensors.
@@ -25,8 +28,10 @@ from typing import Protocol
 
 import gtsam
 import numpy as np
+from scipy.spatial import cKDTree
 
 from data_tools.lidar import (
+    Observability,
     Registration,
     RegistrationError,
     Scan,
@@ -36,11 +41,18 @@ from data_tools.lidar import (
     register,
     voxel_downsample,
 )
+from data_tools.lidar.places import Structure, upright
 from data_tools.lidar.scan import ScanSequence
 from data_tools.trajectories import rotation_angle
 from saga_fg.errors import InputError, require_type
 from saga_fg.numerics.arrays import FloatArray, checked
-from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform, transform_points
+from saga_fg.numerics.geometry import (
+    carried_covariance,
+    checked_transform,
+    inverse_transform,
+    transform_points,
+    yaw_transform,
+)
 from saga_fg.settings import Positive, Settings, setting
 
 _FIRST_DEVIATION = 1.0  # standard deviation of the first motion, m
@@ -56,6 +68,13 @@ KEYFRAME_ROTATION = 0.05  # rotation from the last keyframe that makes a scan th
 LOST_TRANSLATION = 1.0  # standard deviation of a motion along what points leave open, m
 LOST_ROTATION = 0.05  # standard deviation of a rotation that was only predicted, rad
 _CLEARLY, _SKEWED = 0.9, 3  # of the residual; rounds that take the skew out of the first two scans
+_UNKNOWN_SPEED = 10.0  # m/s, standard deviation of a speed that nothing has shown yet
+_UNKNOWN_ACCELERATION = 1.0  # m/s^2/sqrt(Hz), of a vehicle along a motion that scans leave open
+_LOST, _POOR, _WORSE = 0.75, 0.85, 2.0  # of the usual share of points with pairs, and of the usual residual
+_USUAL = 0.1  # weight of the newest scan in what is usual
+_BEGIN_ANEW = 10  # scans in a row that do not fit, after which they enter the map all the same
+_SHIFTS, _TURNS = np.arange(-12.0, 12.1, 1.5), np.linspace(-np.pi, np.pi, 36, endpoint=False)  # m, rad: where to look
+_STANDING_POINTS, _TRIED = 60, 10  # of a scan that are laid on the map; places that are registered
 
 
 @dataclass(frozen=True)
@@ -97,8 +116,6 @@ class OdometryStep:
 class LidarOdometry:
     """Takes scans in order of time and returns the pose of each."""
 
-    registers = True
-
     def __init__(self, settings: OdometrySettings | None = None) -> None:
         self.settings = settings or OdometrySettings()
         self._map = SurfelMap(self.settings.surfel_size, self.settings.max_range)
@@ -107,9 +124,12 @@ class LidarOdometry:
         self._velocity = np.zeros(6)  # rad/s, m/s, in the sensor's frame
         self._squares, self._count = _FIRST_DEVIATION**2, 1
         self._first: Scan | None = None  # with its skew, until the second one comes
+        self._usual: FloatArray | None = None  # (2,) share of points with pairs, and residual, m, of scans that fit
         self._degenerate: tuple[str, ...] = ()
         self._velocity_known = False  # by a scan that showed the whole motion, or by other sensors
         self._confirmed: float | None = None  # s, when a scan showed the whole motion, or a speed was taken after one
+        self._misfits = 0  # scans in a row that did not fit
+        self._open: tuple[float, float] | None = None  # since when motions are open, s, and deviation of the speed
         self._registered: OdometryStep | None = None  # the last one that was registered, or the first
         self._lost = 0  # scans since then
         self._refused = False  # whether the last velocity by other sensors was
@@ -135,13 +155,15 @@ class LidarOdometry:
             raise InputError(f"timestamp: expected one after {last.timestamp:.6f} s, got {timestamp:.6f} s")
         if velocity is not None:
             velocity = checked("velocity", velocity, (6,), "finite-or-nan")
-        scan = self._within_range(scan, timestamp)
+        scan, change = self._within_range(scan, timestamp), np.zeros(6)
         if velocity is not None and self._believable(velocity, scan, timestamp):
-            self._velocity = np.where(np.isnan(velocity), self._velocity, velocity)
-            self._velocity_known = True
-            self._confirmed = None if self._confirmed is None else timestamp
+            before, self._velocity = self._velocity, np.where(np.isnan(velocity), self._velocity, velocity)
+            change = self._velocity - before if self._confirmed is not None else change
+            if np.isfinite(velocity[3:]).any():
+                self._velocity_known = True
+                self._confirmed = None if self._confirmed is None else timestamp
         self._first = scan if last is None else None
-        scan = _deskewed(scan, self._velocity)
+        scan = _deskewed(scan, self._velocity + change / 2)
         if last is None:
             placed = OdometryStep(timestamp, np.eye(4), np.zeros((6, 6)), scan, True, None)
         else:
@@ -221,8 +243,7 @@ class LidarOdometry:
 
     def _fit(self, scan: Scan, velocity: FloatArray, dt: float, known: bool = False) -> Registration:
         """A scan registered with the first one, by a velocity."""
-        points = _deskewed(scan, velocity).points
-        thin = points[voxel_downsample(points, self.settings.scan_spacing)]
+        thin = self._thinned(_deskewed(scan, velocity))
         return self._registered_scan(thin, gtsam.Pose3.Expmap(velocity * dt).matrix(), known)
 
     def _new_map(self, scan: Scan) -> SurfelMap:
@@ -232,6 +253,9 @@ class LidarOdometry:
         made.add(scan.points[voxel_downsample(scan.points, s.map_spacing)], np.zeros(3))
         return made
 
+    def _thinned(self, scan: Scan) -> FloatArray:
+        return scan.points[voxel_downsample(scan.points, self.settings.scan_spacing)]
+
     def _registered_scan(self, points: FloatArray, predicted: FloatArray, known: bool = False) -> Registration:
         """Points (N, 3) registered with the map; known: the velocity, so that it holds where surfaces leave it open."""
         s = self.settings
@@ -239,33 +263,94 @@ class LidarOdometry:
         return register(points, self._map, predicted, farthest, 0.1, "hold" if known else "follow")
 
     def _place(self, last: OdometryStep, scan: Scan, timestamp: float) -> OdometryStep:
-        s, dt = self.settings, timestamp - last.timestamp
-        motion = gtsam.Pose3.Expmap(self._velocity * dt).matrix()
-        predicted = last.map_T_lidar @ motion
-        points = scan.points[voxel_downsample(scan.points, s.scan_spacing)]
+        predicted = last.map_T_lidar @ gtsam.Pose3.Expmap(self._velocity * (timestamp - last.timestamp)).matrix()
+        points, found, why = self._thinned(scan), None, ""
         try:
             found = self._registered_scan(points, predicted, self._velocity_known)
         except RegistrationError as error:
-            _LOG.warning("scan at %.3f s: %s; the motion of the one before goes on", timestamp, error)
-            covariance = np.diag([LOST_ROTATION] * 3 + [LOST_TRANSLATION] * 3) ** 2
-            return OdometryStep(timestamp, predicted, covariance, scan, False, None)
+            why = str(error)
+        fits = found is not None and self._fits(found, len(points))
+        again = None if fits else self._found_again(scan.points, points)
+        self._misfits = 0 if fits or again is not None else self._misfits + 1
+        lost = np.diag([LOST_ROTATION] * 3 + [LOST_TRANSLATION] * 3) ** 2
+        if again is not None:
+            off = float(np.linalg.norm((inverse_transform(predicted) @ again.map_T_scan)[:3, 3]))
+            _LOG.warning("scan at %.3f s: it fits the map %.1f m from where it was expected: moved", timestamp, off)
+            self._velocity, self._velocity_known, self._confirmed = np.zeros(6), False, None
+            return OdometryStep(timestamp, again.map_T_scan, again.covariance, scan, True, again, (), self._lost)
+        if found is None:
+            _LOG.warning("scan at %.3f s: %s; the motion of the one before goes on", timestamp, why)
+            return OdometryStep(timestamp, predicted, lost, scan, False, None)
         self._adapt(inverse_transform(predicted) @ found.map_T_scan, points)
         before = self._registered or last
         since_then = inverse_transform(before.map_T_lidar) @ found.map_T_scan
         self._velocity = constant_velocity(since_then, timestamp - before.timestamp)
-        keyframe = moved_on(inverse_transform(self._keyframe) @ found.map_T_scan)
+        in_doubt = 0 < self._misfits < _BEGIN_ANEW
+        keyframe = not in_doubt and moved_on(inverse_transform(self._keyframe) @ found.map_T_scan)
         names = found.observed.names(self._velocity[3:] if np.linalg.norm(self._velocity[3:]) > _STANDING else None)
-        covariance = found.covariance
+        covariance = found.covariance + self._of_open_motions(found.observed, last.timestamp, timestamp)
         self._velocity_known |= not names
         if not names:
             self._confirmed = timestamp
-        else:
-            open_motions = found.observed.lost / found.observed.scale
-            covariance = covariance + LOST_TRANSLATION**2 * open_motions.T @ open_motions
         if names != self._degenerate:
             _LOG.warning("scan at %.3f s: %s", timestamp, _said(names))
             self._degenerate = names
         return OdometryStep(timestamp, found.map_T_scan, covariance, scan, keyframe, found, names, self._lost)
+
+    def _of_open_motions(self, observed: Observability, before: float, now: float) -> FloatArray:
+        """Covariance (6, 6) of a step along motions that the scan leaves open.
+
+        An unknown speed is one error of all steps, not a new one in each: variances of the steps add up to that of the
+        whole way, v^2 t^2 + a^2 t^3 / 3, t since the motion was last seen.
+        """
+        if not len(observed.lost):
+            self._open = None
+            return np.zeros((6, 6))
+        since, speed = self._open = self._open or (before, 0.0 if self._velocity_known else _UNKNOWN_SPEED)
+        ended, begun = ((speed * t) ** 2 + _UNKNOWN_ACCELERATION**2 * t**3 / 3 for t in (now - since, before - since))
+        motions = observed.lost / observed.scale
+        return np.asarray(max(LOST_TRANSLATION**2, ended - begun) * motions.T @ motions)
+
+    def _fits(self, found: Registration, count: int) -> bool:
+        """Whether a scan of so many points overlaps with the map, and lies on its surfels, as scans before it did."""
+        fit = np.array([found.pairs / count, found.residual])
+        usual = fit if self._usual is None else self._usual
+        good = bool(fit[0] >= (_LOST if fit[1] <= _WORSE * usual[1] else _POOR) * usual[0])
+        if good:
+            self._usual = usual + _USUAL * (fit - usual)
+        return good
+
+    def _found_again(self, points: FloatArray, thin: FloatArray) -> Registration | None:
+        """The registration of a scan that does not fit where it was expected, near the last one that did; None: none.
+
+        What stands above the ground is laid on the map in all directions. The places with most of it on the map are
+        registered, and the first where the scan fits as scans before it is taken.
+        """
+        centre = self._registered
+        if self._usual is None or centre is None or not len(points):
+            return None
+        standing = Structure.of(points).points[:, :2]
+        if len(standing) < _STANDING_POINTS:
+            return None
+        x, y, yaw = (a.ravel() for a in np.meshgrid(_SHIFTS, _SHIFTS, _TURNS, indexing="ij"))
+        c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+        few = standing[:: len(standing) // _STANDING_POINTS]
+        turned = np.stack(
+            [c * few[:, 0] - s * few[:, 1] + x[:, None], s * few[:, 0] + c * few[:, 1] + y[:, None]], axis=2
+        )
+        level = centre.map_T_lidar @ upright(centre.map_T_lidar)
+        around = Structure.of(transform_points(inverse_transform(level), self._map.surfels.mean)).points
+        distance, _ = cKDTree(around[:, :2]).query(turned, distance_upper_bound=self.settings.surfel_size)
+        for row in np.argsort(-np.isfinite(distance).mean(axis=1), kind="stable")[:_TRIED].tolist():
+            start = level @ yaw_transform(float(x[row]), float(y[row]), 0.0, float(yaw[row]))
+            try:
+                rough = register(thin, self._map, start, 3 * self.settings.surfel_size, 1.0)
+                found = register(thin, self._map, rough.map_T_scan, self.settings.surfel_size, 0.1)
+            except RegistrationError:
+                continue
+            if found.converged and self._fits(found, len(thin)):
+                return found
+        return None
 
     def _adapt(self, deviation: FloatArray, points: FloatArray) -> None:
         span = float(np.median(np.linalg.norm(points, axis=1)))
@@ -411,10 +496,7 @@ def checked_step(step: object) -> OdometryStep:
 
 
 class Odometry(Protocol):
-    """Places scans one by one, in the frame of the first; `LidarOdometry` is one.
-
-    One with an attribute `registers` that is True registers scans with each other, so that they show things straight.
-    """
+    """Places scans one by one, in the frame of the first; `LidarOdometry` is one."""
 
     def step(self, scan: Scan, timestamp: float, velocity: FloatArray | None = None) -> OdometryStep:
         """Place the next scan; velocity: by other sensors, as of `LidarOdometry.step`."""

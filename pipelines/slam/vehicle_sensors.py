@@ -8,6 +8,9 @@ registration determines, as x ahead:
 Until k is known, speeds enter the graph only where scans leave motions open; from then on they are multiplied by it.
 A warning says where it is off 1 by more than `_SURE` deviations, that of k and the `share` of the settings together.
 Wheels whose steps are far from those of the scans are left out.
+
+Inertial samples predict each scan: from the pose, velocity and biases of the newest keyframe in the graph, by
+preintegration as in `saga_fg.providers.Imu`. The graph has the same samples as factors between keyframes.
 """
 
 from __future__ import annotations
@@ -24,11 +27,13 @@ from data_tools.lidar.recording import scan_context
 from data_tools.lidar.scan import ScanSequence
 from pipelines.slam.odometry import LidarOdometry, Odometry, OdometrySettings, OdometryStep, checked_step
 from saga_fg.errors import InputError
-from saga_fg.graph import FactorProvider
+from saga_fg.estimators import IncrementalSmoother
+from saga_fg.graph import EGO_BIAS, EGO_POSE, EGO_VELOCITY, FactorProvider
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform, yaw_transform
-from saga_fg.providers import Wheels
-from saga_fg.providers.odometry import mounting
+from saga_fg.providers import Imu, Wheels
+from saga_fg.providers.navigation import GRAVITY
+from saga_fg.providers.odometry import mounting, on_pose
 from saga_fg.slam.sensors import SensorConsistency, SensorName, SensorSettings, sensor_providers
 from saga_fg.types.frame import Detections, EgoMeasurements, Frame, ImuSamples, WheelSpeed
 
@@ -181,6 +186,48 @@ class WheelComparison:
         )
 
 
+_KNOWN_SPEED = 1.0  # m/s, standard deviation of the velocity in the graph up to which it predicts
+
+
+class InertialPrediction:
+    """Predicts the motion of the LiDAR to each scan by the samples since the scan before, and the graph's newest state.
+
+    settings: of the sensor, placed on the pose of the LiDAR
+    """
+
+    def __init__(self, settings: Imu) -> None:
+        self._parameters = gtsam.PreintegrationParams.MakeSharedU(GRAVITY)
+        self._parameters.setBodyPSensor(mounting("mounted", settings.mounted))
+        self._max_gap = settings.max_gap
+        self._state: gtsam.NavState | None = None
+        self._bias, self._known, self._time = gtsam.imuBias.ConstantBias(), False, 0.0
+
+    def begin(self, smoother: IncrementalSmoother) -> None:
+        """Go on from the newest state of a graph."""
+        graph = smoother.graph()
+        pose, velocity, bias = (graph.of(kind, graph.epoch)[0].key for kind in (EGO_POSE, EGO_VELOCITY, EGO_BIAS))
+        self._state = gtsam.NavState(graph.state(pose), graph.state(velocity))
+        self._bias, self._time = graph.state(bias), graph.time
+        self._known = bool(np.linalg.eigvalsh(smoother.covariance(velocity))[-1] < _KNOWN_SPEED**2)
+
+    def velocity(self, time: float, samples: ImuSamples | None) -> FloatArray | None:
+        """Velocity (6,), rad/s and m/s, of the LiDAR since the scan before; NaN for an unknown translation.
+
+        None without a state, and where samples are missing.
+        """
+        before, dt = self._state, time - self._time
+        if before is None or samples is None or abs(dt - float(samples.dt.sum())) > self._max_gap:
+            self._state = None
+            return None
+        measured = gtsam.PreintegratedImuMeasurements(self._parameters, self._bias)
+        for length, force, rate in zip(samples.dt.tolist(), samples.acceleration, samples.angular_rate, strict=True):
+            measured.integrateMeasurement(force, rate, length)
+        now = measured.predict(before, self._bias)
+        self._state, self._time = now, time
+        xi = gtsam.Pose3.Logmap(before.pose().between(now.pose())) / dt
+        return np.asarray(xi if self._known else np.concatenate([xi[:3], np.full(3, np.nan)]))
+
+
 @dataclass(frozen=True, eq=False)
 class Vehicle:
     """The vehicle that carries the LiDAR.
@@ -211,6 +258,7 @@ class VehicleSensors:
         self.since_keyframe = BetweenKeyframes(self.names, others_read, self._settings.wheels.deviation)
         self.consistency = SensorConsistency(self.names, self._settings)
         self._wheels = WheelComparison(self._settings.wheels, self.ego_T_lidar)
+        self._inertial = InertialPrediction(on_pose(self._settings.imu, self.lidar_T_ego))
 
     def new_providers(self) -> list[FactorProvider]:
         """Fresh providers of their factors."""
@@ -222,7 +270,10 @@ class VehicleSensors:
         Warns once if wheels do not fit the scans.
         """
         wheels = measured.wheels if "wheels" in self.names else None
-        step = checked_step(odometry.step(scan, time, self._velocity(self._wheels.corrected(wheels))))
+        velocity = self._velocity(self._wheels.corrected(wheels))
+        if "imu" in self.names and (inertial := self._inertial.velocity(time, measured.imu)) is not None:
+            velocity = inertial if velocity is None else np.where(np.isnan(inertial), velocity, inertial)
+        step = checked_step(odometry.step(scan, time, velocity))
         if "wheels" in self.names:
             used, misfit = self._wheels.compared(wheels, step)
             measured = replace(measured, wheels=used)
@@ -230,6 +281,11 @@ class VehicleSensors:
                 self.consistency.state("wheels", misfit)
         self.since_keyframe.add(time, measured)
         return step
+
+    def begin(self, smoother: IncrementalSmoother) -> None:
+        """Predict from the newest keyframe of a graph on."""
+        if "imu" in self.names:
+            self._inertial.begin(smoother)
 
     def _velocity(self, wheels: WheelSpeed | None) -> FloatArray | None:
         """The velocity (6,) of the LiDAR by the wheels, as `LidarOdometry.step` takes it; None without them."""

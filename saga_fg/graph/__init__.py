@@ -5,7 +5,6 @@ from saga_fg.graph.providers import Additions, FactorProvider, GraphView, ask_al
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import (
     EGO_BIAS,
-    EGO_CALIBRATION,
     EGO_ERROR,
     EGO_POSE,
     EGO_VELOCITY,
@@ -23,7 +22,6 @@ from saga_fg.graph.variables import (
 
 __all__ = [
     "EGO_BIAS",
-    "EGO_CALIBRATION",
     "EGO_ERROR",
     "EGO_POSE",
     "EGO_VELOCITY",

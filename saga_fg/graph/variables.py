@@ -84,10 +84,9 @@ EGO_POSE = VariableKind("ego pose", "x")
 EGO_VELOCITY = VariableKind("ego velocity", "v")
 EGO_BIAS = VariableKind("ego bias", "b")  # of accelerometers and gyroscopes
 EGO_ERROR = VariableKind("ego error", "e")  # slow errors of the odometry
-EGO_CALIBRATION = VariableKind("calibration", "c")  # of the vehicle's sensors, for all time
 LANDMARK = VariableKind("landmark", "l")
 MAP_NODE = VariableKind("map node", "m")
-KINDS = (OBJECT, EGO_POSE, EGO_VELOCITY, EGO_BIAS, EGO_ERROR, EGO_CALIBRATION, LANDMARK, MAP_NODE)
+KINDS = (OBJECT, EGO_POSE, EGO_VELOCITY, EGO_BIAS, EGO_ERROR, LANDMARK, MAP_NODE)
 
 
 def key_of(kind: VariableKind, id: int, epoch: int | None) -> int:  # noqa: A002 -- GTSAM and the tables call it id

@@ -3,19 +3,18 @@
 The vehicle's place by satellites: r = t + R a - z, with a the antenna's place on the vehicle.
 
 A fix that is older than the frame by dt was taken at exp(-dt xi) a in the vehicle's frame of now, xi its velocity over
-the epoch. The antenna's place can be a variable for all time. A fix far off is left out by a gate, which is as wide as
-the pose is uncertain; what passes is under a robust loss.
+the epoch. A fix far off is left out by a gate, which is as wide as the pose is uncertain; what passes is under a robust
+loss.
 
 The vehicle's pose, velocity and the biases of its inertial sensors from epoch to epoch, by preintegration.
 
 GTSAM's `CombinedImuFactor` between (pose, velocity, biases) of two epochs (Forster, Carlone, Dellaert, Scaramuzza,
 "On-manifold preintegration for real-time visual-inertial odometry", IEEE T-RO 33, 2017). The samples of a frame are
 taken for steady over its interval where they last a little longer or shorter than the epoch. Where there are none, or
-too few, the vehicle goes straight on, with noise on its acceleration and its rate of turn: the same factor of one
-coarse sample.
+too few, the vehicle goes straight on, with noise on its acceleration and its rate of turn: the same factor of coarse
+samples.
 
-The sensor may sit anywhere on the vehicle (`mounted`). Its turn there can be a variable for all time: the factor is
-then between the poses of the sensor, and the velocity is the sensor's.
+The sensor may sit anywhere on the vehicle (`mounted`).
 """
 
 from __future__ import annotations
@@ -29,20 +28,18 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import ImuBias, PlanarPose, ResidualFactors, Robust, SpatialPose, Vector, prior_factor, residual_factor
+from factors import PlanarPose, Robust, SpatialPose, prior_factor, residual_factor
 from saga_fg.errors import InputError
-from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.providers import Additions, GraphView
-from saga_fg.graph.variables import EGO_BIAS, EGO_CALIBRATION, EGO_POSE, EGO_VELOCITY, NewVariable
+from saga_fg.graph.variables import EGO_BIAS, EGO_POSE, EGO_VELOCITY, NewVariable
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.numerics.geometry import chi_square_quantile
-from saga_fg.providers.odometry import ANTENNA, INERTIAL, NO_POSE, ON_THE_POSE, Mounting, StartSettings, mounting
+from saga_fg.providers.odometry import NO_POSE, ON_THE_POSE, Mounting, StartSettings, mounting
 from saga_fg.settings import Fraction, Positive, PositiveOrInf, Settings, setting, settings_group
 from saga_fg.types.frame import ImuSamples
 
 _LOG = logging.getLogger(__name__)
 GRAVITY = 9.81  # m/s^2, which differs by 0.3 % at most from place to place, less than a bias
-ANTENNA_DEVIATION = 0.5  # standard deviation of the antenna's position beforehand, by axis, m
 
 
 @dataclass(frozen=True)
@@ -56,7 +53,6 @@ class Gps(Settings):
     outlier_scale: PositiveOrInf = setting(
         math.inf, "residual from which the Cauchy loss discounts a fix, standard deviations; .inf: never"
     )
-    estimate_antenna: bool = setting(False, "true: the antenna's position is a variable of the graph; poses in space")
     name = "gps"
 
     def __post_init__(self) -> None:
@@ -81,9 +77,9 @@ class Gps(Settings):
             R = np.diag(np.square([self.deviation, self.deviation, self.height_deviation]))
         R = R[:dim, :dim]
         robust = None if math.isinf(self.outlier_scale) else Robust("cauchy", self.outlier_scale)
-        antenna = _moved_back(view, pose.key, np.array(self.antenna), fix.age)
-        on_vehicle, of_pose = antenna[:dim], PlanarPose() if dim == 2 else SpatialPose()
-        factor = residual_factor([pose.key], [of_pose], partial(_off, z, on_vehicle), R, robust=robust, name="fix")
+        antenna = _moved_back(view, pose.key, np.array(self.antenna), fix.age)[:dim]
+        of_pose = PlanarPose() if dim == 2 else SpatialPose()
+        factor = residual_factor([pose.key], [of_pose], partial(_off, z, antenna), R, robust=robust, name="fix")
         if self.gate < 1:
             values = gtsam.Values()
             values.insert(pose.key, view.state(pose.key))
@@ -94,23 +90,11 @@ class Gps(Settings):
                     "%s at %.2f s: a fix %.1f m off is left out", self.name, view.time, float(np.linalg.norm(r))
                 )
                 return Additions()
-        if not self.estimate_antenna:
-            return Additions(factors=[factor])
-        if dim == 2:
-            raise InputError("gps: estimate_antenna: expected the vehicle's pose in space, got one in the plane")
-        key, place, new = view.key(EGO_CALIBRATION, ANTENNA, static=True), np.array(self.antenna), list[NewVariable]()
-        priors = list[Factor]()
-        if ANTENNA not in view.static(EGO_CALIBRATION):
-            new.append(NewVariable(EGO_CALIBRATION, ANTENNA, place, static=True, label="place of the antenna"))
-            priors.append(prior_factor(key, place, ANTENNA_DEVIATION**2 * np.eye(3)))
-        function = partial(_off, z, antenna - place)
-        factor = residual_factor([pose.key, key], [of_pose, Vector(3)], function, R, robust=robust, name="fix")
-        return Additions(new, [*priors, factor])
+        return Additions(factors=[factor])
 
 
-def _off(z: FloatArray, place: FloatArray, pose: gtsam.Pose2 | gtsam.Pose3, *antenna: FloatArray) -> FloatArray:
-    """How far off a fix is; antenna: where it is estimated, its place, which `place` is then counted from."""
-    return np.asarray(pose.transformFrom(sum(antenna, place)) - z)
+def _off(z: FloatArray, antenna: FloatArray, pose: gtsam.Pose2 | gtsam.Pose3) -> FloatArray:
+    return np.asarray(pose.transformFrom(antenna) - z)
 
 
 def _moved_back(view: GraphView, key: int, antenna: FloatArray, age: float) -> FloatArray:
@@ -127,7 +111,7 @@ def _moved_back(view: GraphView, key: int, antenna: FloatArray, age: float) -> F
 INTEGRATION_NOISE = 1e-4  # noise density of integrating the position, m/s/sqrt(Hz)
 UNKNOWN_ACCELERATION = 3.0  # noise density of the acceleration in gaps of the samples, m/s^2/sqrt(Hz)
 UNKNOWN_TURN = 0.3  # noise density of the turn rate in gaps of the samples, rad/s/sqrt(Hz)
-ROTATION_DEVIATION = 0.05  # standard deviation of the sensor's rotation beforehand, by axis, rad
+_COARSE = 0.1  # s, of samples in gaps: with one for all of it a place would tell the velocity
 
 
 @dataclass(frozen=True)
@@ -147,7 +131,6 @@ class Imu(Settings):
         0.05, "longest time of an epoch without samples, s; where they lack more, the epoch is bridged as unknown"
     )
     mounted: Mounting = setting(ON_THE_POSE, "x, y, z (m), roll, pitch, yaw (rad) of the sensor in the vehicle's frame")
-    estimate_rotation: bool = setting(False, "true: the sensor's rotation on the vehicle is a variable of the graph")
     name = "imu"
 
     def __post_init__(self) -> None:
@@ -169,20 +152,14 @@ class Imu(Settings):
         if not isinstance(view.state(pose), gtsam.Pose3):
             raise InputError("imu: expected the vehicle's pose in space (start.planar: false), got one in the plane")
         now = [view.key(kind, 0) for kind in kinds]
-        onto = self._place if self.estimate_rotation else gtsam.Pose3()  # the sensor's pose in place of the vehicle's
-        measured = self._preintegrated(view, view.state(pose).compose(onto), view.state(bias))
-        begin = gtsam.NavState(view.state(pose).compose(onto), view.state(velocity))
-        moved = measured.predict(begin, view.state(bias))
+        measured = self._preintegrated(view, view.state(pose), view.state(bias))
+        moved = measured.predict(gtsam.NavState(view.state(pose), view.state(velocity)), view.state(bias))
         new = [
             NewVariable(EGO_VELOCITY, 0, np.array(moved.velocity()), label="vehicle's velocity"),
             NewVariable(EGO_BIAS, 0, view.state(bias), label="imu bias"),
         ]
         if not view.now(EGO_POSE):
-            new.append(NewVariable(EGO_POSE, 0, moved.pose().compose(onto.inverse()), label="vehicle"))
-        if self.estimate_rotation:
-            rotation, more = self._rotation(view)
-            keys = (pose, velocity, now[0], now[1], bias, now[2], rotation)
-            return Additions([*new, *more.variables], [*list(more.factors), self._turned(keys, measured)])  # type: ignore[arg-type]
+            new.append(NewVariable(EGO_POSE, 0, moved.pose(), label="vehicle"))
         return Additions(new, [gtsam.CombinedImuFactor(pose, velocity, now[0], now[1], bias, now[2], measured)])
 
     def factors(self, view: GraphView) -> Additions:
@@ -208,20 +185,6 @@ class Imu(Settings):
             ],
         )
 
-    def _rotation(self, view: GraphView) -> tuple[int, Additions]:
-        """Key of the sensor's rotation (3,), as a rotation vector from where the settings have it."""
-        key = view.key(EGO_CALIBRATION, INERTIAL, static=True)
-        if INERTIAL in view.static(EGO_CALIBRATION):
-            return key, Additions()
-        new = NewVariable(EGO_CALIBRATION, INERTIAL, np.zeros(3), static=True, label="rotation of the imu")
-        return key, Additions([new], [prior_factor(key, np.zeros(3), ROTATION_DEVIATION**2 * np.eye(3))])
-
-    def _turned(self, keys: tuple[int, ...], measured: gtsam.PreintegratedCombinedMeasurements) -> ResidualFactors:
-        types = (SpatialPose(), Vector(3), SpatialPose(), Vector(3), ImuBias(), ImuBias(), Vector(3))
-        native = gtsam.CombinedImuFactor(*keys[:6], measured)  # type: ignore[call-overload]
-        covariance = native.noiseModel().covariance()
-        return residual_factor(keys, types, partial(_turned, native, self._place), covariance, name="inertial samples")
-
     def _preintegrated(
         self, view: GraphView, pose: gtsam.Pose3, bias: gtsam.imuBias.ConstantBias
     ) -> gtsam.PreintegratedCombinedMeasurements:
@@ -235,10 +198,11 @@ class Imu(Settings):
             samples = None
         known = samples is not None
         if samples is None:
-            turned = pose.rotation() if self.estimate_rotation else pose.compose(self._place).rotation()
-            up = turned.matrix().T @ [[0.0], [0.0], [GRAVITY]]
+            up = pose.compose(self._place).rotation().matrix().T @ [[0.0], [0.0], [GRAVITY]]
             corrected = bias.vector()[None]  # what sensors with these biases would say of straight on
-            samples = ImuSamples(np.array([view.dt]), up.T + corrected[:, :3], corrected[:, 3:])
+            steps, steady = math.ceil(view.dt / _COARSE) or 1, np.hstack([up.T + corrected[:, :3], corrected[:, 3:]])
+            each = np.repeat(steady, steps, axis=0)
+            samples = ImuSamples(np.full(steps, view.dt / steps), each[:, :3], each[:, 3:])
         parameters = self._parameters(known)
         measured = gtsam.PreintegratedCombinedMeasurements(parameters, bias)
         share = view.dt / float(samples.dt.sum())
@@ -248,8 +212,7 @@ class Imu(Settings):
 
     def _parameters(self, known: bool) -> gtsam.PreintegrationCombinedParams:
         parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY)
-        if not self.estimate_rotation:
-            parameters.setBodyPSensor(self._place)
+        parameters.setBodyPSensor(self._place)
         noises = (self.accelerometer_noise, self.gyroscope_noise)
         for name, deviation in (
             ("Accelerometer", noises[0] if known else UNKNOWN_ACCELERATION),
@@ -260,9 +223,3 @@ class Imu(Settings):
         ):
             getattr(parameters, f"set{name}Covariance")(deviation**2 * np.eye(3))
         return parameters
-
-
-def _turned(native: gtsam.CombinedImuFactor, place: gtsam.Pose3, *states: Any) -> FloatArray:
-    first, v1, second, v2, bias1, bias2, rotation = states
-    mounted = place.compose(gtsam.Pose3(gtsam.Rot3.Expmap(rotation), np.zeros(3)))
-    return np.asarray(native.evaluateError(first.compose(mounted), v1, second.compose(mounted), v2, bias1, bias2))

@@ -155,7 +155,6 @@ def _motion_of(reported: OdometryIncrement, planar: bool) -> Pose:
 
 Mounting = tuple[float, float, float, float, float, float]
 ON_THE_POSE: Mounting = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-ANTENNA, INERTIAL = range(2)  # ids of calibrations
 Provider = TypeVar("Provider")
 
 

@@ -1,7 +1,5 @@
 """The mapper of planar drives: maps whose cost does not grow, merging, and covariances that are honest."""
 
-from itertools import product
-
 import gtsam
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ from scipy.stats import chi2
 from benchmarks.landmark_mapper import LandmarkMapper, MapperSettings
 from benchmarks.landmark_merging import NearbyLandmarks, duplicates, place_of
 from saga_fg import InputError
-from saga_fg.model.landmarks import LineLandmark, PlaneLandmark, PointLandmark, PoleLandmark
+from saga_fg.model.landmarks import PlaneLandmark, PointLandmark, PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.mapping import LocalMap
 from saga_fg.types.frame import Observation
@@ -135,28 +133,12 @@ def test_constellations_are_recognised_and_what_was_seen_side_by_side_is_never_o
     assert duplicates(local, 0.999, {(1, 3)}) == {4: 2}
 
 
-def test_an_edge_is_one_whichever_way_its_normal_points(subtests):
-    """A curb in any direction, seen again a little turned: theta beyond pi, or (theta + pi, -rho)."""
-    for way, side in product([0.0, np.pi / 2, np.pi, -np.pi + 1e-3], [4.0, 0.0]):
-        with subtests.test(way=way, side=side):
-            kind, noise = LineLandmark(), 0.01 * np.eye(2)
-            local = LocalMap(np.eye(4), 1e-6 * np.eye(6))
-            for number, (turn, shift) in enumerate([(0.002, 0.02), (-0.002, -0.02)], start=1):
-                along = np.array([np.cos(way + turn), np.sin(way + turn), 0.0])
-                foot = (side + shift) * np.array([-along[1], along[0], 0.0])
-                local.augment(number, Observation(kind, np.concatenate([foot - 5 * along, foot + 5 * along]), noise))
-            local.augment(3, Observation(kind, np.array([-5.0, -9.0, 0.0, 5.0, 11.0, 0.0]), noise))
-            assert duplicates(local, 0.999, set()) == {2: 1}
-
-
-# Planes, poles and road lines are recovered within their stated covariance: the chi-square test over many drives
+# Planes and poles are recovered within their stated covariance: the chi-square test over many drives
 
 DRIVES = 30
 CONSISTENCY_Q = np.diag([0.003, 0.003, 0.004, 0.03, 0.02, 0.02]) ** 2  # of a motion: rad, m
 R_PLANE, R_POLE = np.diag([0.01, 0.01, 0.05]) ** 2, np.diag([0.08, 0.05]) ** 2
-R_EDGE = np.array([[0.0064, 0.002], [0.002, 0.01]])
-# edges are rare: what is tested is the covariance, not who is taken for whom
-POLE, LINE, PLANE = PoleLandmark(), LineLandmark(density=1e-3), PlaneLandmark()
+POLE, PLANE = PoleLandmark(), PlaneLandmark()
 
 
 def drawn(rng: np.random.Generator, covariance: FloatArray) -> FloatArray:
@@ -169,7 +151,6 @@ def drive(seed: int) -> tuple[dict[str, tuple[float, int]], float]:
     poles = np.array([[5.0, 6.0], [14.0, -7.0], [22.0, 6.5]]) + rng.uniform(-1, 1, (3, 2))
     walls = np.array([[0, -1, 0.05, 12], [-1, 0.1, 0, 45]])
     planes = [gtsam.OrientedPlane3(wall / np.linalg.norm(wall[:3])) for wall in walls]
-    lines = np.array([[np.pi / 2 + rng.normal(0, 0.05), 4.0], [-np.pi / 2 + rng.normal(0, 0.05), 3.5]])
     pose = gtsam.Pose3(gtsam.Rot3.Yaw(rng.normal(0, 0.1)), np.array([0.0, 0.0, 1.5]))
     mapper = LandmarkMapper(pose.matrix(), 1e-8 * np.eye(6), MapperSettings(smooth_every=30))
     for _ in range(9):
@@ -182,19 +163,12 @@ def drive(seed: int) -> tuple[dict[str, tuple[float, int]], float]:
         for plane in planes:
             noisy = plane.transform(pose).retract(drawn(rng, R_PLANE))
             seen.append(Observation(PLANE, noisy.planeCoefficients(), R_PLANE))
-        for theta, rho in lines:
-            n, along = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
-            middle = float(along @ pose.translation()[:2])
-            off = rho + drawn(rng, R_EDGE)
-            at = middle + np.array([rng.uniform(-9, -4), rng.uniform(4, 9)])
-            ends = np.column_stack([off[:, None] * n + at[:, None] * along, np.zeros(2)])
-            seen.append(Observation(LINE, np.concatenate([pose.transformTo(end) for end in ends]), R_EDGE))
         mapper.observe(seen)
         step = gtsam.Pose3(gtsam.Rot3.Yaw(0.01), np.array([1.5, 0.0, 0.0]))
         pose = pose.compose(step)
         mapper.move(step.retract(drawn(rng, CONSISTENCY_Q)).matrix(), CONSISTENCY_Q)
     mapper.smooth()
-    truth = {"pole": list(poles), "plane": planes, "road line": list(lines)}
+    truth = {"pole": list(poles), "plane": planes}
     found = {}
     for name, things in truth.items():
         numbers = sorted(n for n, kind in mapper.local.kinds.items() if kind.name == name)
@@ -215,7 +189,7 @@ def drives() -> list[tuple[dict[str, tuple[float, int]], float]]:
 
 
 def test_squared_errors_of_landmarks_and_poses_lie_in_the_band(drives, subtests):
-    for kind in ["pole", "plane", "road line"]:
+    for kind in ["pole", "plane"]:
         with subtests.test(kind=kind):
             squared = sum(found[kind][0] for found, _ in drives)
             dim = sum(found[kind][1] for found, _ in drives)

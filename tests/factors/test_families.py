@@ -7,7 +7,6 @@ import pytest
 from factors import (
     Bearing,
     FactorError,
-    HesseLine,
     Polar,
     Radar,
     Range,
@@ -15,7 +14,6 @@ from factors import (
     RangeRate,
     Robust,
     detection_factors,
-    line_factors,
     linearised,
     nonlinear_graph,
     odometry_factors,
@@ -95,11 +93,6 @@ def plane(rng, keys, covariance):
     return made, [poses, held]
 
 
-def edge(rng, keys, covariance):
-    factors = line_factors(keys, rng.normal(0, 5, (N, 2, 3)), np.stack([covariance(rng, 2) for _ in range(N)]))
-    return [factors], [[some_pose(rng) for _ in range(N)], rng.uniform(-3, 3, (N, 2))]
-
-
 def odometry(rng, keys, covariance):
     a, steps = random_poses(rng, N), random_poses(rng, N)
     b = a @ steps @ random_poses(rng, N)
@@ -109,7 +102,7 @@ def odometry(rng, keys, covariance):
 
 CASES = {
     "point in the plane": seen(2), "point in space": seen(3), "object in the plane": seen(2, 5, (3, 1)),
-    "object from a pose in space": seen(3, 5, (3, 1)), "plane": plane, "edge": edge,
+    "object from a pose in space": seen(3, 5, (3, 1)), "plane": plane,
     "range and bearing from a pose": seen(2, 5, (3, 1), RangeBearing(2)), "odometry": odometry,
     **{f"detection, {name}": detection(model) for name, model in POLAR.items()},
 }  # fmt: skip
@@ -216,16 +209,6 @@ def test_robust_detections_give_gtsams_answer(loss):
     theirs = gtsam.LevenbergMarquardtOptimizer(graph, start, params).optimize()
     np.testing.assert_allclose(solution.values.atVector(5), theirs.atVector(5), atol=1e-5)
     np.testing.assert_allclose(solution.values.atVector(5)[:2], truth[:2], atol=0.3)  # not drawn to the outliers
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_lines_are_compared_whatever_they_are_written_as(seed):
-    rng = np.random.default_rng(seed)
-    kind, line = HesseLine(), np.array([rng.uniform(-9, 9), rng.normal(0, 5)])
-    step = np.array([rng.uniform(-1.5, 1.5), rng.normal()])
-    theta, rho = kind.retract(line, step)
-    for same in ((theta, rho), (theta - 2 * np.pi, rho), (theta + np.pi, -rho), (theta - 3 * np.pi, -rho)):
-        np.testing.assert_allclose(kind.local(line, np.array(same)), step, atol=1e-12)
 
 
 def test_odometry_without_errors_is_the_increment_between_two_poses():

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.inertial import DRIVES, SETTINGS, end_nees, inertial_drive
 from benchmarks.scans import SENSOR_HEIGHT, ScannerSettings, SimulatedScans, StaticWorld, drive
 from data_tools.lidar import Scan
 from data_tools.recordings import ScanRecording
@@ -92,6 +93,23 @@ def test_over_a_field_gps_and_wheels_carry_the_pose(caplog: pytest.LogCaptureFix
     assert re.search(r"gps: 1 of \d+ fixes lie more than 9 deviations off, and hardly count", caplog.text)
     assert all("across the road" in motions for motions in found.degenerate[1:])
     assert found.misfits == {}
+
+
+def test_an_imu_predicts_and_straightens_scans_in_fast_turns() -> None:
+    drive = inertial_drive(DRIVES["turns"], 1)
+    ends = {}
+    for name, log in (("without", None), ("with", SensorLog({"imu": drive.imu}))):
+        found = lidar_slam(drive, settings=SETTINGS, log=log)
+        ends[name] = np.linalg.norm(found.trajectory.positions[-1] - drive.world_T_ego[-1, :3, 3])
+    assert ends["with"] < 0.3 < 3.0 < ends["without"]
+    assert end_nees(found, drive) < 4.0
+
+
+def test_a_sensor_that_was_carried_is_found_again(caplog: pytest.LogCaptureFixture) -> None:
+    drive = inertial_drive(DRIVES["carried"], 1, carried_at=66.0)
+    found = lidar_slam(drive, settings=SETTINGS)
+    assert len(re.findall(r"it fits the map \d+\.\d m from where it was expected: moved", caplog.text)) == 1
+    assert np.linalg.norm(found.trajectory.positions - drive.world_T_ego[:, :3, 3], axis=1).max() < 0.5
 
 
 def test_spans_of_scans_that_leave_the_same_motions_open() -> None:

@@ -1,7 +1,6 @@
 """Joint estimation of the vehicle's path and the objects around it."""
 
-from saga_fg.slam.joint.estimators import OnlineEstimator, estimate_jointly
-from saga_fg.slam.joint.graph import JointEstimate, ObjectStates
+from saga_fg.slam.joint.graph import JointEstimate, ObjectStates, estimate_jointly
 from saga_fg.slam.joint.record import JointSettings, OdometryIncrements, OdometryNoise
 
 __all__ = [
@@ -10,6 +9,5 @@ __all__ = [
     "ObjectStates",
     "OdometryIncrements",
     "OdometryNoise",
-    "OnlineEstimator",
     "estimate_jointly",
 ]

@@ -1,4 +1,4 @@
-"""Factors of a record of the vehicle and objects around it, and the estimate read from their solution.
+"""The vehicle's path and the objects around it, from a whole recording: factors of a record, and their solution.
 
 Factors of a record: poses of the vehicle, errors of its odometry, and states of objects, over time.
 
@@ -13,11 +13,15 @@ stationary and a landmark, else it moves as its class does and the factor is sil
 variable is a `gtsam.Pose3` for the vehicle and a vector for everything else.
 
 Providers add them, for a whole recording or a window of epochs.
+
+Discrete unknowns depend on the path: the association of detections, and the stationarity of objects. A pass associates
+along the path so far, starting with the odometry's, takes the probabilities of stationarity from the detections, and
+solves the graph of all epochs. Passes end when associations repeat.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -32,6 +36,7 @@ from factors import (
     ResidualFactors,
     Robust,
     Solution,
+    SolverSettings,
     gaussian_factors,
     interaction_factor,
     odometry_factors,
@@ -40,17 +45,37 @@ from factors import (
 )
 from saga_fg.errors import InputError
 from saga_fg.estimators.batch import GraphSolution
-from saga_fg.graph import EGO_ERROR, EGO_POSE, OBJECT, Additions, GraphView, NewVariable, key_of
+from saga_fg.graph import (
+    EGO_ERROR,
+    EGO_POSE,
+    OBJECT,
+    Additions,
+    FactorProvider,
+    GraphView,
+    NewVariable,
+    SceneFactorGraph,
+    ask_all,
+    key_of,
+)
 from saga_fg.graph.factor_checks import Factor
-from saga_fg.graph.providers import Factors
 from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.motion import NodeType
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import Assignment
 from saga_fg.numerics.geometry import transform_points
-from saga_fg.slam.joint.association import SlowErrors
-from saga_fg.slam.joint.record import JointSettings, RecordedEpoch, RecordedObjects, motion_covariances
-from saga_fg.slam.mapping import Given, pose_key
+from saga_fg.slam.joint.association import SlowErrors, stationary_probabilities
+from saga_fg.slam.joint.record import (
+    MAX_ITERATIONS,
+    JointSettings,
+    OdometryIncrements,
+    RecordedEpoch,
+    RecordedObjects,
+    motion_covariances,
+    record_epochs,
+)
+from saga_fg.slam.mapping import pose_key
+from saga_fg.tracking import Tracker
+from saga_fg.types.frame import Frame
 
 _START_NOISE = 1e-3  # standard deviation of the first pose, m and rad
 _LIKELY = 0.9  # stationary with less than this probability: no such factor, since creeping queues are in doubt, too
@@ -297,9 +322,6 @@ def _objects(now: RecordedEpoch, values: gtsam.Values, stationary: FloatArray) -
     return ObjectStates(objects.id, objects.label, state[:, :2], state[:, 2:], stationary)
 
 
-_SAME = 1e-3  # probability
-
-
 @dataclass(frozen=True, eq=False)
 class VehicleAndObjects:
     """Add the epochs of `record`, one a frame, of which the graph has the first `known` already.
@@ -341,22 +363,65 @@ class VehicleAndObjects:
         return Additions(new, factors)
 
 
-class StationaryPairs:
-    """Factors of stationary objects for every two epochs, given anew where the probabilities have changed."""
+TOLERANCE = 1.0  # standard deviations of the last step, over all variables together
 
+
+def estimate_jointly(
+    frames: Sequence[Frame],
+    odometry: OdometryIncrements,
+    new_tracker: Callable[[], Tracker],
+    settings: JointSettings | None = None,
+    start: FloatArray | None = None,
+    new_providers: Callable[[], Sequence[FactorProvider]] = tuple,
+) -> JointEstimate:
+    """Estimate the path (n poses) and the objects of n frames, in increasing order of time.
+
+    odometry: between the frames' times; new_tracker: gives a new tracker, which associates detections; start: first
+    pose (4, 4), by default the identity; new_providers: gives new providers of other factors, asked with each frame
+    (`saga_fg.slam.mapping.LandmarkObservations` for landmarks). Detections are in ego or sensor coordinates, or in
+    those of the world with the pose they were transformed by. Raises `InputError` where frames and odometry do not fit
+    together.
+    """
+    settings = settings or JointSettings()
+    times = np.array([frame.timestamp for frame in frames])
+    if len(times) != len(odometry) or not np.allclose(times, odometry.timestamps, atol=1e-6):
+        raise InputError(f"frames: expected one at each of the {len(odometry)} times of the odometry, got {len(times)}")
+    path = odometry.path(start)
+    slow = SlowErrors.at_start(settings)
+    estimate = None
+    links: list[list[int]] = []
+    for _ in range(settings.passes):
+        tracker = new_tracker()
+        record = record_epochs(frames, path, odometry, tracker)
+        before, links = links, [now.seen.id.tolist() for now in record]
+        if links == before:
+            break
+        start_moving = estimate is None
+        epochs = VehicleAndObjects(record, path, settings)
+        estimate = _solve(epochs, frames, slow, start_moving, new_providers())
+        path, slow = estimate.world_T_ego, estimate.slow_errors
+    assert estimate is not None
+    return estimate
+
+
+def _solve(
+    epochs: VehicleAndObjects,
+    frames: Sequence[Frame],
+    slow: SlowErrors,
+    start_moving: bool,
+    providers: Sequence[FactorProvider],
+) -> JointEstimate:
+    """Solve the epochs of a record several times, each from the solution before: if `start_moving` with all objects
+    moving, which needs no good start; then with those stationary that seem so along the path.
+    """
+    graph, solver = SceneFactorGraph(), SolverSettings(max_iterations=MAX_ITERATIONS, tolerance=TOLERANCE)
+    record, settings = epochs.record, epochs.settings
+    for now, frame in zip(record, frames, strict=True):
+        graph.advance(now.time)
+        ask_all([epochs, *providers], graph, frame)
+    if start_moving:
+        graph.solve(solver)
+    probabilities = stationary_probabilities(record, np.asarray(epochs.path), slow, settings)
     name = "stationary objects"
-
-    def __init__(self) -> None:
-        self._given: dict[int, tuple[FloatArray, FloatArray]] = {}
-
-    def changed(self, record: Record, stationary: Sequence[FloatArray]) -> Given:
-        """Return the provider of a window, with the probabilities (n,) of the objects of each epoch."""
-        named: dict[Hashable, Factors] = {}
-        given: dict[int, tuple[FloatArray, FloatArray]] = {}
-        for pair, rows in zip(pairwise(stationary), pairwise(record), strict=True):
-            k, before = rows[1].epoch, self._given.get(rows[1].epoch)
-            if before is None or not all(np.allclose(a, b, atol=_SAME) for a, b in zip(before, pair, strict=True)):
-                named[k], before = stationary_factors(rows, pair), pair
-            given[k] = before
-        self._given = given
-        return Given(Additions(named=named), self.name)
+    graph.add_factors(name, stationary_factors(record, probabilities), name)
+    return read_estimate(record, graph.solve(solver), probabilities)

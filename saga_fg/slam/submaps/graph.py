@@ -245,7 +245,7 @@ class SubmapGraph:
         self.settings = settings or SubmapSettings()
         self._providers = recorded(providers)
         relinearisation = RelinearisationSettings(self.settings.relinearise_above)
-        self._smoother = IncrementalSmoother(lag=None, settings=relinearisation, elimination="cholesky")
+        self.smoother = IncrementalSmoother(lag=None, settings=relinearisation, elimination="cholesky")
         self._motions: list[Motion] = [(world_T_first, covariance)]
         self._times: list[float] = []
         self._seen: list[Sequence[tuple[int, Observation]]] = []
@@ -266,7 +266,7 @@ class SubmapGraph:
     @property
     def size(self) -> int:
         """Number of variables in the running graph."""
-        return len(self._smoother.graph().variables)
+        return len(self.smoother.graph().variables)
 
     def append(
         self,
@@ -294,7 +294,7 @@ class SubmapGraph:
         motion_provider = MeasuredMotion(*measured, start)
         starts = {n: one.kind.initialise(start, one.value) for n, one in now if n >= self._numbers}
         seen = LandmarkObservations({k: now}, starts, self.settings.robust)
-        self._smoother.step(time, [motion_provider, seen, *self._providers], frame)
+        self.smoother.step(time, [motion_provider, seen, *self._providers], frame)
         self._landmarks, self._way = landmarks, way
         self._numbers = max(self._numbers, *(n + 1 for n in numbers), 0)
         if k:
@@ -313,7 +313,7 @@ class SubmapGraph:
         if not loops:
             return
         factors = loop_factors(loops, self._anchors, self.settings.robust_loops)
-        self._smoother.extend([Given(Additions(factors=factors), "loops")], settings=_AFTER_LOOPS)
+        self.smoother.extend([Given(Additions(factors=factors), "loops")], settings=_AFTER_LOOPS)
         self._loops += loops
 
     def pose(self, k: int) -> FloatArray:
@@ -325,7 +325,7 @@ class SubmapGraph:
 
     def covariance(self) -> FloatArray:
         """The covariance (6, 6) of the newest keyframe's pose."""
-        return self._smoother.covariance(pose_key(len(self) - 1))
+        return self.smoother.covariance(pose_key(len(self) - 1))
 
     def world_T_anchor(self) -> FloatArray:
         """The present estimates (n, 4, 4) of all anchors."""
@@ -371,7 +371,7 @@ class SubmapGraph:
         return graph, landmarks
 
     def _running(self, k: int) -> FloatArray:
-        state: Any = self._smoother.state(pose_key(k))
+        state: Any = self.smoother.state(pose_key(k))
         return np.asarray(state.matrix())
 
     def _begin_submap(self, k: int) -> None:
@@ -385,10 +385,10 @@ class SubmapGraph:
         mine = {n for now in self._seen[anchor:successor] for n, _ in now}
         world = inverse_transform(self._running(anchor))
         self._offsets += [np.eye(4), *(world @ self._running(k) for k in range(anchor + 1, successor))]
-        variables, anchors = self._smoother.graph().variables.values(), set(map(pose_key, self._anchors))
+        variables, anchors = self.smoother.graph().variables.values(), set(map(pose_key, self._anchors))
         old = [one.key for one in variables if one.epoch is not None and one.epoch < successor]
         leaving = [*(key for key in old if key not in anchors), *map(landmark_key, mine)]
-        self._smoother.marginalise(leaving, CondensedSubmap(pose_key(anchor), pose_key(successor)))
+        self.smoother.marginalise(leaving, CondensedSubmap(pose_key(anchor), pose_key(successor)))
 
     def _confirmed(self) -> dict[int, Sequence[tuple[int, Observation]]]:
         """Observations of landmarks that were seen often enough, by keyframe."""
@@ -399,11 +399,11 @@ class SubmapGraph:
     def _starts(self, poses: FloatArray) -> Mapping[int, Any]:
         """Initial values of landmarks; in closed submaps from the last observation, since anchors have moved."""
         start: dict[int, Any] = {}
-        running = self._smoother.graph().variables
+        running = self.smoother.graph().variables
         for k, now in enumerate(self._seen):
             for number, one in now:
                 if landmark_key(number) not in running:
                     start[number] = one.kind.initialise(poses[k], one.value)
                 elif number not in start:
-                    start[number] = self._smoother.state(landmark_key(number))
+                    start[number] = self.smoother.state(landmark_key(number))
         return start

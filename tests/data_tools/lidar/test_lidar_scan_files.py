@@ -74,7 +74,7 @@ def test_every_format_gives_the_same_points(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", ["scan.ply", "scan.npy"])
 def test_points_without_intensity_have_none(tmp_path: Path, name: str) -> None:
     if name == "scan.ply":
-        write_cloud(tmp_path / name, POINTS, np.full((3, 3), 200, dtype=np.uint8))
+        write_cloud(tmp_path / name, POINTS)
     else:
         np.save(tmp_path / name, POINTS)
     scan = read_scan(tmp_path / name)
@@ -249,12 +249,6 @@ def test_an_array_of_another_shape_and_an_archive_without_points_are_refused(tmp
         read_scan(tmp_path / "flat.npy")
     with pytest.raises(InputError, match=r"expected the array points"):
         read_scan(tmp_path / "other.npz")
-
-
-def test_colours_must_fit_the_points(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"colours: expected \(3, 3\) bytes"):
-        write_cloud(tmp_path / "a.ply", POINTS, np.zeros((2, 3), dtype=np.uint8))
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_scan_is_checked_and_cut_by_range() -> None:

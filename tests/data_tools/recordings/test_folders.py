@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.scans import SimulatedScans
+from benchmarks.scans import SMALL, SimulatedScans, drive, simulate_scan, street
 from data_tools.lidar import Scan
 from data_tools.recordings import RecordingOptions, open_recording
 from data_tools.recordings.layouts import GROUP
@@ -27,8 +27,8 @@ KINDS = [kind for kind in FOLDERS if kind != "las" or find_spec("laspy") is not 
 
 @pytest.fixture(scope="module")
 def scans() -> list[Scan]:
-    drive = SimulatedScans(0, 4)
-    return [drive[k] for k in range(len(drive))]
+    taken = SimulatedScans(0, 4)
+    return [taken[k] for k in range(len(taken))]
 
 
 TIMES = BEGIN + 0.1 * np.arange(4)
@@ -194,16 +194,18 @@ def test_what_is_wrong_in_a_folder_is_one_line(
         write_scan(folder / "000003.bin", scans[3], timed=False)
         with pytest.raises(InputError, match=r"000002\.bin: expected the columns x, y, z, intensity of the scans"):
             open_recording(folder)[2]
-    with subtests.test("another sensor"):
-        folder = folder_of(tmp_path / "another", scans, 2)
-        looking_up = scans[2].points * [1, 1, -4]
-        write_scan(folder / "000002.bin", Scan.of(looking_up), timed=False)
-        found = open_recording(folder)
-        for k in (0, 1):
-            assert len(found[k])
-        assert "of another sensor" not in caplog.text
-        assert len(found[2])
-        assert "000002.bin: its points are at elevations of" in caplog.text
+
+
+@pytest.mark.parametrize("rear", [yaw_transform(-2.0, yaw=np.pi), yaw_transform(0.0, 1.0, yaw=np.pi / 2)])
+def test_scans_of_two_sensors_in_turn_are_refused(tmp_path: Path, rear: np.ndarray) -> None:
+    rng, world = np.random.default_rng(0), street(0)
+    poses = [pose @ (rear if k % 2 else np.eye(4)) for k, pose in enumerate(drive(24))]
+    taken = [simulate_scan(world, pose, rng, SMALL) for pose in poses]
+    found = open_recording(write_scans(tmp_path / "two", "npz", taken, 0.1 * np.arange(24)))
+    with pytest.raises(InputError, match=r"\.npz: expected scans of one sensor: 6 of the last 20"):
+        [found[k] for k in range(len(found))]
+    alone = open_recording(write_scans(tmp_path / "one", "npz", taken[::2], 0.1 * np.arange(12)))
+    assert all(len(alone[k]) for k in range(len(alone)))
 
 
 def test_kitti_s_layouts(tmp_path: Path, scans: list[Scan], caplog: pytest.LogCaptureFixture) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from benchmarks.online_joint import OnlineEstimator
 from factors import prior_factor
 from saga_fg import Boxes, Detections, Frame, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.graph import EGO_VELOCITY, Additions, GraphView, NewVariable
@@ -17,7 +18,6 @@ from saga_fg.slam.joint import (
     JointSettings,
     OdometryIncrements,
     OdometryNoise,
-    OnlineEstimator,
     estimate_jointly,
 )
 from saga_fg.slam.joint.association import SlowErrors, stationary_probabilities

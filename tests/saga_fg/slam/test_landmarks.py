@@ -13,12 +13,12 @@ from factors import Robust
 from saga_fg import InputError
 from saga_fg.estimators import BatchSolver, IncrementalSmoother
 from saga_fg.graph import GraphError, SceneFactorGraph, ask_all
-from saga_fg.model.landmarks import LineLandmark, PlaneLandmark, PointLandmark, PoleLandmark
+from saga_fg.model.landmarks import PlaneLandmark, PointLandmark, PoleLandmark
 from saga_fg.numerics.arrays import FloatArray
 from saga_fg.slam.mapping import LandmarkObservations, LocalMap, MeasuredMotion, associate, landmark_key, pose_key
 from saga_fg.types.frame import LandmarkType, Observation
 
-KINDS: list[LandmarkType] = [PointLandmark(), PointLandmark(dim=3), PoleLandmark(), PlaneLandmark(), LineLandmark()]
+KINDS: list[LandmarkType] = [PointLandmark(), PointLandmark(dim=3), PoleLandmark(), PlaneLandmark()]
 POLE = np.diag([0.1, 0.1]) ** 2
 TREE, R = PointLandmark(density=0.01), 0.05**2 * np.eye(2)
 Q = np.diag([0.02, 0.02, 0.002]) ** 2
@@ -34,8 +34,6 @@ def some_observation(kind: LandmarkType, rng: np.random.Generator) -> FloatArray
     if isinstance(kind, PlaneLandmark):
         normal = rng.normal(size=3)
         return np.append(normal / np.linalg.norm(normal), rng.uniform(2, 9))
-    if isinstance(kind, LineLandmark):
-        return rng.normal(0, 8, 6)
     return rng.normal(0, 8, 2 if isinstance(kind, PointLandmark) and kind.dim == 2 else 3)
 
 
@@ -120,7 +118,6 @@ def test_what_cannot_be_is_refused(subtests):
         (lambda: Observation(PoleLandmark(), [1, 2, np.nan], np.eye(2)), "observed pole"),
         (lambda: Observation(PoleLandmark(), [1, 2, 3], np.eye(3)), "covariance of a pole"),
         (lambda: Observation(PlaneLandmark(), [0, 0, 1, 2], -np.eye(3)), "positive definite"),
-        (lambda: LineLandmark().initialise(np.eye(4), np.tile([3.0, 2.0, 0.0], 2)), "two ends that are apart"),
         (lambda: PointLandmark(dim=4), "dim: expected 2 or 3"),
         (lambda: PoleLandmark(density=0.0), "density"),
     ]:

@@ -10,10 +10,10 @@ import pytest
 
 from saga_fg import Detections, Frame, InputError
 from saga_fg.estimators import BatchSolver, IncrementalSmoother
-from saga_fg.graph import EGO_BIAS, EGO_CALIBRATION, EGO_POSE
+from saga_fg.graph import EGO_BIAS, EGO_POSE
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.providers import Gps, Imu, StartSettings, Wheels
-from saga_fg.providers.odometry import ANTENNA, INERTIAL, mounting
+from saga_fg.providers.odometry import mounting
 from saga_fg.slam.mapping.mapper import MeasuredMotion
 from saga_fg.slam.sensors import SensorBuffer, SensorConsistency, SensorSettings, sensor_providers
 
@@ -60,9 +60,6 @@ class Run:
         consistency = SensorConsistency(sensors, settings)
         consistency.observe(self.smoother.graph())
         return consistency.misfits
-
-    def static(self, number: int) -> np.ndarray:
-        return np.asarray(self.smoother.state(self.smoother.graph().of(EGO_CALIBRATION, None)[number].key))
 
 
 def run(
@@ -185,23 +182,6 @@ def test_a_sensor_in_another_place_is_named(subtests):
             assert found[sensor].startswith(f"{sensor}: ")
             assert "check " in found[sensor]
             assert run(("gps", "imu", "wheels"), batch=True).misfits(("gps", "imu", "wheels"), SETTINGS) == {}
-
-
-def test_places_are_estimated_if_asked():
-    true = SensorSettings(
-        replace(SETTINGS.gps, antenna=(0.6, -0.4, 1.0), deviation=0.2, height_deviation=0.2),
-        replace(IMU, mounted=(0.0, 0.0, 0.0, 0.02, -0.03, 0.05)),
-        SETTINGS.wheels,
-    )
-    asked = SensorSettings(
-        replace(true.gps, antenna=(0.0, 0.0, 1.0), estimate_antenna=True),
-        replace(IMU, estimate_rotation=True),
-        SETTINGS.wheels,
-    )
-    found = run(("gps", "imu", "wheels"), asked, true=true, batch=True)
-    assert found.errors.max() < 0.5
-    np.testing.assert_allclose(found.static(ANTENNA), [0.6, -0.4, 1.0], atol=0.25)
-    np.testing.assert_allclose(found.static(INERTIAL), [0.02, -0.03, 0.05], atol=0.015)
 
 
 def test_measurements_come_in_order_of_time():

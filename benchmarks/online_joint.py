@@ -1,117 +1,64 @@
-"""Path of the vehicle and objects around it: from a whole recording at once, and online.
+"""The vehicle's path and the objects around it online: what `benchmarks joint --online` measures.
 
-Discrete unknowns depend on the path: the association of detections, and the stationarity of objects.
-
-From a recording, a pass associates along the path so far, starting with the odometry's, takes the probabilities of
-stationarity from the detections, and solves the graph of all epochs. Passes end when associations repeat.
-
-Online, each frame adds an epoch to the running graph of the last seconds. The stationarity of objects follows from the
-window, and iSAM2 solves that with the new factors. Epochs older than `lag` leave: they are marginalised with all
-factors on their variables, linearised at the present estimate.
+Each frame adds an epoch to the running graph of the last seconds. The stationarity of objects follows from the window,
+and iSAM2 solves that with the new factors. Epochs older than `lag` leave: they are marginalised with all factors on
+their variables, linearised at the present estimate. On recordings it pays neither for the path nor for the objects
+beside a tracker along LiDAR odometry, so that no command offers it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Hashable, Sequence
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 
-from factors import SolverSettings
 from saga_fg.errors import InputError
 from saga_fg.estimators.batch import GraphSolution
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
-from saga_fg.graph import FactorProvider, GraphError, SceneFactorGraph, ask_all
+from saga_fg.graph import Additions, FactorProvider, GraphError
+from saga_fg.graph.providers import Factors
 from saga_fg.numerics.arrays import FloatArray, checked_covariances
 from saga_fg.numerics.geometry import checked_transform, yaw_transform
-from saga_fg.slam.joint.association import (
-    SlowErrors,
-    stationary_probabilities,
-)
+from saga_fg.slam.joint.association import SlowErrors, stationary_probabilities
 from saga_fg.slam.joint.graph import (
     JointEstimate,
-    StationaryPairs,
+    Record,
     VehicleAndObjects,
     error_key,
     read_estimate,
     stationary_factors,
 )
-from saga_fg.slam.joint.record import (
-    MAX_ITERATIONS,
-    EpochRecorder,
-    JointSettings,
-    OdometryIncrements,
-    RecordedEpoch,
-    record_epochs,
-)
-from saga_fg.slam.mapping import pose_key
+from saga_fg.slam.joint.record import MAX_ITERATIONS, EpochRecorder, JointSettings, RecordedEpoch
+from saga_fg.slam.mapping import Given, pose_key
 from saga_fg.tracking import Tracker
 from saga_fg.types.frame import Frame
 
-TOLERANCE = 1.0  # standard deviations of the last step, over all variables together
+_SAME = 1e-3  # probability
 
 
-def estimate_jointly(
-    frames: Sequence[Frame],
-    odometry: OdometryIncrements,
-    new_tracker: Callable[[], Tracker],
-    settings: JointSettings | None = None,
-    start: FloatArray | None = None,
-    new_providers: Callable[[], Sequence[FactorProvider]] = tuple,
-) -> JointEstimate:
-    """Estimate the path (n poses) and the objects of n frames, in increasing order of time.
+class StationaryPairs:
+    """Factors of stationary objects for every two epochs, given anew where the probabilities have changed."""
 
-    odometry: between the frames' times; new_tracker: gives a new tracker, which associates detections; start: first
-    pose (4, 4), by default the identity; new_providers: gives new providers of other factors, asked with each frame
-    (`saga_fg.slam.mapping.LandmarkObservations` for landmarks). Detections are in ego or sensor coordinates, or in
-    those of the world with the pose they were transformed by. Raises `InputError` where frames and odometry do not fit
-    together.
-    """
-    settings = settings or JointSettings()
-    times = np.array([frame.timestamp for frame in frames])
-    if len(times) != len(odometry) or not np.allclose(times, odometry.timestamps, atol=1e-6):
-        raise InputError(f"frames: expected one at each of the {len(odometry)} times of the odometry, got {len(times)}")
-    path = odometry.path(start)
-    slow = SlowErrors.at_start(settings)
-    estimate = None
-    links: list[list[int]] = []
-    for _ in range(settings.passes):
-        tracker = new_tracker()
-        record = record_epochs(frames, path, odometry, tracker)
-        before, links = links, [now.seen.id.tolist() for now in record]
-        if links == before:
-            break
-        start_moving = estimate is None
-        epochs = VehicleAndObjects(record, path, settings)
-        estimate = _solve(epochs, frames, slow, start_moving, new_providers())
-        path, slow = estimate.world_T_ego, estimate.slow_errors
-    assert estimate is not None
-    return estimate
+    name = "stationary objects"
 
+    def __init__(self) -> None:
+        self._given: dict[int, tuple[FloatArray, FloatArray]] = {}
 
-def _solve(
-    epochs: VehicleAndObjects,
-    frames: Sequence[Frame],
-    slow: SlowErrors,
-    start_moving: bool,
-    providers: Sequence[FactorProvider],
-) -> JointEstimate:
-    """Solve the epochs of a record several times, each from the solution before: if `start_moving` with all objects
-    moving, which needs no good start; then with those stationary that seem so along the path.
-    """
-    graph, solver = SceneFactorGraph(), SolverSettings(max_iterations=MAX_ITERATIONS, tolerance=TOLERANCE)
-    record, settings = epochs.record, epochs.settings
-    for now, frame in zip(record, frames, strict=True):
-        graph.advance(now.time)
-        ask_all([epochs, *providers], graph, frame)
-    if start_moving:
-        graph.solve(solver)
-    probabilities = stationary_probabilities(record, np.asarray(epochs.path), slow, settings)
-    name = StationaryPairs.name
-    graph.add_factors(name, stationary_factors(record, probabilities), name)
-    return read_estimate(record, graph.solve(solver), probabilities)
+    def changed(self, record: Record, stationary: Sequence[FloatArray]) -> Given:
+        """Return the provider of a window, with the probabilities (n,) of the objects of each epoch."""
+        named: dict[Hashable, Factors] = {}
+        given: dict[int, tuple[FloatArray, FloatArray]] = {}
+        for pair, rows in zip(pairwise(stationary), pairwise(record), strict=True):
+            k, before = rows[1].epoch, self._given.get(rows[1].epoch)
+            if before is None or not all(np.allclose(a, b, atol=_SAME) for a, b in zip(before, pair, strict=True)):
+                named[k], before = stationary_factors(rows, pair), pair
+            given[k] = before
+        self._given = given
+        return Given(Additions(named=named), self.name)
 
 
 _THRESHOLD = 0.1  # standard deviations that a variable moves before its factors are linearised anew
