@@ -35,8 +35,9 @@ from scipy.special import ndtr
 from data_tools.lidar import Scan, Submap, voxel_downsample
 from data_tools.lidar.scan import inside_boxes, without_objects
 from data_tools.trajectories import Trajectory
+from pipelines.slam.drive import Drive, moved_pose
 from pipelines.slam.loop_closures import ClosedSubmaps, LoopSearch
-from pipelines.slam.odometry import Drive, Odometry, OdometryStep, moved_pose
+from pipelines.slam.odometry import Odometry, OdometryStep
 from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from pipelines.slam.vehicle_sensors import Vehicle, VehicleSensors
 from saga_fg.errors import InputError

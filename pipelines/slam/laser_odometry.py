@@ -23,8 +23,9 @@ import numpy as np
 from data_tools.laser import LaserLog
 from data_tools.laser.mapping import SMEAR, Fit, LineMap, ScoreGrid, thinned
 from data_tools.lidar import Scan, Submap
+from pipelines.slam.drive import motion
 from pipelines.slam.loop_closures import Agreement, LoopSearch
-from pipelines.slam.odometry import OdometryStep, motion
+from pipelines.slam.odometry import OdometryStep
 from pipelines.slam.vehicle_sensors import WheelScale
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray, IntArray

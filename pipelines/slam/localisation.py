@@ -39,8 +39,9 @@ from data_tools.lidar.scan import ScanSequence
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from factors import Robust, pose_prior_factor
+from pipelines.slam.drive import Drive, moved_pose
 from pipelines.slam.loop_closures import COMPARED, FEWEST, SURFEL, agreeing, fits_otherwise, registered
-from pipelines.slam.odometry import LOST_TRANSLATION, Drive, LidarOdometry, OdometrySettings, moved_pose
+from pipelines.slam.odometry import LOST_TRANSLATION, LidarOdometry, OdometrySettings
 from pipelines.slam.submaps import SlamMap, placed_clouds
 from pipelines.slam.vehicle_sensors import Vehicle, VehicleSensors
 from pipelines.tracking import Progress

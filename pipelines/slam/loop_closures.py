@@ -48,7 +48,7 @@ from data_tools.lidar import (
 )
 from data_tools.lidar.places import PlaceImage, PlaceIndex, PlaceMatch, Structure
 from data_tools.lidar.registration import Undetermined
-from pipelines.slam.odometry import LEAST
+from pipelines.slam.drive import LEAST
 from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import carried_covariance, inverse_transform

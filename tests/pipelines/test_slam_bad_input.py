@@ -10,8 +10,9 @@ import pytest
 
 from benchmarks.scans import SimulatedScans
 from data_tools.lidar import Scan
+from pipelines.slam.drive import motion, shared
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings
-from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep, RecordedOdometry, motion, shared
+from pipelines.slam.odometry import LidarOdometry, OdometrySettings, OdometryStep, RecordedOdometry
 from pipelines.slam.vehicle_sensors import BetweenKeyframes, Vehicle
 from saga_fg.errors import InputError
 from saga_fg.graph import Additions, GraphView
