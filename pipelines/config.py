@@ -16,7 +16,7 @@ from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.stability import LearnedInteractions
 from saga_fg.settings import settings_group
 from saga_fg.tracking import AssociationName, ClassSettings, GreedySettings, Observer
-from saga_fg.tracking.dense_traffic import DENSE_TRAFFIC
+from saga_fg.tracking.dense_traffic import dense_traffic_settings
 from saga_fg.types.by_class import DEFAULT, class_settings
 
 Method = Literal["saga", "kf", "centerpoint"]
@@ -106,7 +106,7 @@ def load_config(family: str | Path, path: Path | None = None) -> TrackConfig:
     """The defaults shipped for a kind of data, with what a YAML file overrides.
 
     family  name of a kind of data, or the path of a YAML file over the defaults of "file"; those of "traffic" and
-            "dense" are over `DENSE_TRAFFIC`
+            "dense" are over `dense_traffic_settings`
 
     Raises `InputError` for an unknown kind, and naming the file and the dotted key of what is wrong in it.
     """
@@ -114,6 +114,6 @@ def load_config(family: str | Path, path: Path | None = None) -> TrackConfig:
         config = load_settings(TrackConfig, family, load_config("file"))
     else:
         shipped = shipped_settings(family)
-        base = TrackConfig(tracker=DENSE_TRAFFIC) if family in ("traffic", "dense") else None
+        base = TrackConfig(tracker=dense_traffic_settings()) if family in ("traffic", "dense") else None
         config = read_settings(TrackConfig, shipped.read_text(encoding="utf-8"), shipped.name, base)
     return config if path is None else load_settings(TrackConfig, path, config, OTHER_FILES)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from data_tools.datasets import import_options
 from data_tools.datasets.detection_files import TableImport, TruthTable, read_tracks, read_truth
-from data_tools.datasets.detection_files.dataset import read_detections, read_scenes_in_parts
+from data_tools.datasets.detection_files.dataset import dense_traffic_of, read_detections, read_scenes_in_parts
 from data_tools.datasets.results import Results, SceneResult, clear_figures, table_results
 from data_tools.datasets.source import (
     TRACKING,
@@ -28,7 +28,6 @@ from data_tools.datasets.source import (
 from data_tools.files.file_access import expanded, local_copy, name_of
 from saga_fg.errors import InputError
 from saga_fg.tables.column_names import pairs
-from saga_fg.tracking.dense_traffic import seems_dense_traffic
 from saga_fg.types.dataset import Dataset, Scene
 
 if TYPE_CHECKING:
@@ -129,11 +128,14 @@ class DetectionFileSource(DatasetSource):
         return own.over(self.table_import or TableImport())
 
     def dense_traffic(self) -> str:
-        """Why the settings for dense traffic fit, "" if they do not: `like`, or what the first rows look like."""
-        if self.like is not None or not self.detections or "://" in self.detections[0]:
+        """Why the settings for dense traffic fit, "" if they do not: `like`, or what the first rows look like.
+
+        Several tables have settings of their own only where `like` says so.
+        """
+        if self.like is not None or len(self.detections or ()) != 1 or not Path(self._table()).is_file():
             return "--like dense" if self.like == "dense" else ""
-        first = next(read_scenes_in_parts(expanded(self.detections)[0], how=self.how), None)
-        return "" if first is None else seems_dense_traffic(first.frames)
+        with local_copy(self._table()) as path:
+            return dense_traffic_of(path, self.how)
 
     def __str__(self) -> str:
         return ", ".join(name_of(place) for place in self.detections or ()) or "a table of tracks"

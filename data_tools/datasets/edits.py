@@ -48,13 +48,17 @@ class Edits:
 
     def __init__(self, result: SceneResult, theirs: SceneBoxes, back: IntArray) -> None:
         self.scene, self.ours, self.theirs = result.scene, result.found, theirs
-        step = np.append(np.diff(result.scene.timestamps), 0.0).max()
+        step = float(np.median(np.diff(result.scene.timestamps))) if len(result.scene) > 1 else 0.0
         self.seen = np.nan_to_num(0.0 if result.coasting is None else result.coasting) <= step / 2
         self.seen = np.broadcast_to(self.seen, len(self.ours))
         self.pair = _pairs(self.ours, theirs)
         self.gone = np.isin(self.ours.frame, back)
         self.gone[self.pair[self.pair >= 0]] = False
+        missing = np.setdiff1d(np.unique(self.ours.frame), back)
         self.problems: list[str] = []
+        if len(missing):
+            frames = f"{len(missing)} frames, the first {missing[0]}, did not come back"
+            self.problems.append(f"{frames}: their labels stay as they are")
 
     def corrections(self) -> list[Record]:
         """Return the corrections, as lines of a file, that turn labels into those that came back."""

@@ -33,7 +33,13 @@ from data_tools.files.readers import parsed_json
 from data_tools.metrics import SceneBoxes
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics.arrays import IntArray
-from saga_fg.numerics.geometry import inverse_transform, quaternion_yaw, rotation_quaternion, yaw_quaternion
+from saga_fg.numerics.geometry import (
+    checked_quaternions,
+    inverse_transform,
+    quaternion_yaw,
+    rotation_quaternion,
+    yaw_quaternion,
+)
 from saga_fg.types.boxes import MAX_POSITION, Boxes
 from saga_fg.types.dataset import Scene
 
@@ -90,8 +96,12 @@ def write_for_tool(path: Path, tool: str, result: SceneResult) -> None:
     tool_format(tool).write(path, scene, frames)
 
 
-def read_from_tool(path: Path, tool: str, scene: Scene, classes: Collection[str]) -> tuple[SceneBoxes, IntArray]:
+def read_from_tool(
+    path: Path, tool: str, scene: Scene, classes: Collection[str], open_classes: bool = False
+) -> tuple[SceneBoxes, IntArray]:
     """Read the boxes of a scene, world coordinates, and which of its frames the tool handed back.
+
+    classes  that there are, however they are capitalised; open_classes: others are taken as they are
 
     Raises `InputError` for a broken file, a frame that the scene has not, and a class that is not among `classes`.
     """
@@ -103,10 +113,10 @@ def read_from_tool(path: Path, tool: str, scene: Scene, classes: Collection[str]
             if not 0 <= k < len(scene) or k in found:
                 raise InputError(f"expected each frame once, of the recording's 0 to {len(scene) - 1}")
             for _, label, _ in rows:
-                if label.casefold() not in known:
+                if label.casefold() not in known and not open_classes:
                     raise InputError(unknown_name("class", label, tuple(known.values())))
             numbers = np.array([row for _, _, row in rows]).reshape(-1, 7)
-            labels = [known[label.casefold()] for _, label, _ in rows]
+            labels = [known.get(label.casefold(), label) for _, label, _ in rows]
             boxes = Boxes.of(labels, numbers[:, :3], numbers[:, 3:6], numbers[:, 6])
             ids = [id_ or f"{k} {n}" for n, (id_, _, _) in enumerate(rows)]  # a box without a name is an object
             found[k] = ids, boxes.transformed(scene.world_T_ego[k])
@@ -190,8 +200,10 @@ def _openlabel_box(cuboid: Any) -> list[float]:
     val = _numbers(_field(cuboid, "val", list), "val", 9, 10)
     if (system := _field(cuboid, "coordinate_system", str, EGO)) != EGO:
         raise InputError(f"coordinate_system: expected {EGO}, got {system[:40]!r}")
-    yaw = val[5] if len(val) == 9 else float(quaternion_yaw(np.array([val[6], *val[3:6]])))
-    return [*val[:3], *val[-3:], yaw]
+    if len(val) == 9:
+        return [*val[:3], *val[-3:], val[5]]
+    (rotation,) = checked_quaternions("val: rotation", [[val[6], *val[3:6]]])
+    return [*val[:3], *val[-3:], float(quaternion_yaw(rotation))]
 
 
 def _write_cvat(path: Path, scene: Scene, frames: Sequence[Sequence[ToolBox]]) -> None:
@@ -207,10 +219,9 @@ def _write_cvat(path: Path, scene: Scene, frames: Sequence[Sequence[ToolBox]]) -
                 "attributes": {"track_id": int(id_), "keyframe": True, "outside": False, "occluded": False},
                 "position": place,
                 "rotation": [0.0, 0.0, yaw],
-                "scale": size,
+                "scale": [length, width, height],
             }
-            for n, (id_, label, (*place, a, b, c, yaw)) in enumerate(boxes)
-            for size in [[a, b, c]]
+            for n, (id_, label, (*place, length, width, height, yaw)) in enumerate(boxes)
         ]
         items.append({"id": f"{k:06d}", "annotations": annotations, "attr": {"frame": k}})
     named = [{"name": label, "parent": "", "attributes": []} for label in labels]

@@ -11,7 +11,6 @@ import numpy as np
 
 from data_tools.datasets.edits import Edits
 from data_tools.datasets.labelling_tools import exchanged, read_from_tool, tool_format, write_for_tool
-from data_tools.datasets.nuscenes.tables import DETECTION_CLASSES
 from data_tools.files.file_access import atomic_directory, read_text, write_text
 from data_tools.files.readers import parsed_json
 from data_tools.lidar import write_cloud
@@ -29,10 +28,12 @@ WHEN = ("who", "when")  # of a correction, which do not make it another
 def export_labels(folder: Path, run: LabelRun, tool: str, output: Path) -> tuple[int, int]:
     """Write the labels of a folder for a tool, a file or folder for each scene; return the numbers of boxes and scans.
 
-    output: a folder, which appears when all is written. Raises `InputError` where the labels or the recordings can't be
-    read, or the folder is not writable.
+    output: a new or empty folder, which appears when all is written. Raises `InputError` where the labels or the
+    recordings can't be read, and for a folder that is not writable or holds anything: it may be somebody's edits.
     """
     form, boxes, clouds = tool_format(tool), 0, 0
+    if output.is_dir() and any(output.iterdir()):
+        raise InputError(f"{output}: expected a new or an empty folder, it may hold edits")
     with run.open() as (source, dataset), atomic_directory(output) as whole:
         scenes = {name: dataset.scene(name) for name in dataset.scenes}
         scans = source.surroundings(scenes).scans() if form.clouds else {}
@@ -64,15 +65,18 @@ def import_edits(
         scenes = {name: dataset.scene(name) for name in dataset.scenes}
         results = list(labelled_scenes(folder, scenes))
         labels = {label for each in results for label in each.found.boxes.label.tolist()}
-        classes = source.written.classes or tuple(sorted(labels.union(DETECTION_CLASSES)))
+        fixed = source.written.classes
     for result in results:
         path = given / f"{file_name(result.scene.name)}{form.suffix}"
         if not path.exists():
             missing.append(path)
             problems.append(f"{path}: there is no such scene, its labels stay as they are")
             continue
-        compared = Edits(exchanged(result), *read_from_tool(path, tool, result.scene, classes))
+        back = read_from_tool(path, tool, result.scene, fixed or labels, not fixed)
+        compared = Edits(exchanged(result), *back)
         found += compared.corrections()
+        unknown = sorted(set(back[0].boxes.label.tolist()) - labels) if not fixed else []
+        problems += [f"{path}: class {name}: taken over, no label has had it before" for name in unknown]
         problems += [f"{path}: {line}" for line in compared.problems]
     if len(missing) == len(results):
         raise InputError(f"{given}: expected {missing[0].name}, as written by --export {tool}")

@@ -61,6 +61,7 @@ class Ros2Network:
         self._wanted = wanted
         self.subscribed: dict[str, Topic] = {}
         self._readers: dict[str, Any] = {}
+        self._best_effort: set[str] = set()
         try:
             self._participant = DomainParticipant(int(domain))
         except DDSException as error:
@@ -99,9 +100,16 @@ class Ros2Network:
         types = self._wanted[topic] if before is None else [before.type]
         if plain_type(type_) not in types:
             wanted = " or ".join(types)
-            log.warning("%s: expected messages of %s, %s is published: left out", topic, wanted, type_)
-        elif before is None:
-            best_effort = offered[Policy.Reliability] == Policy.Reliability.BestEffort
+            expected = f"expected messages of {wanted}"
+            log.warning("%s: %s, %s is published: left out", topic, expected, type_, extra={"topic": (topic, type_)})
+            return
+        best_effort = offered[Policy.Reliability] == Policy.Reliability.BestEffort
+        if before is not None:
+            if best_effort and topic not in self._best_effort:
+                text = "%s: a publisher offers best effort, and the topic is subscribed reliably: left out"
+                log.warning(text, topic, extra={"topic": (topic, "best effort")})
+        else:
+            self._best_effort |= {topic} if best_effort else set()
             reliability = Policy.Reliability.BestEffort if best_effort else Policy.Reliability.Reliable(BLOCKING)
             quality = _quality(reliability, DEPTH, topic in TRANSIENT)
             dds_topic = DdsTopic(self._participant, f"rt{topic}", _sample_type(type_))

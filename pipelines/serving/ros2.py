@@ -11,6 +11,7 @@ log, one a minute for each topic and kind of fault.
 from __future__ import annotations
 
 import logging
+import re
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -38,6 +39,7 @@ from saga_fg.types.track import Tracks
 log = logging.getLogger(__name__)
 
 PATIENCE = 0.5  # s
+_TOPIC = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 POLL = 0.05  # s between looks at the clock
 DETECTION_TYPES = tuple(name for name in OBJECT_TYPES if definition(name) is not None)
 RESULT_TYPES = {name.partition("/")[2]: name for name in RESULTS if definition(name) is not None}
@@ -59,6 +61,8 @@ def result_topics(values: Iterable[str]) -> dict[str, str | None]:
         kind, equals, topic = value.rpartition("=")
         if equals and kind not in RESULT_TYPES:
             raise InputError(f"--tracks {value}: expected TOPIC or TYPE=TOPIC with one of {', '.join(RESULT_TYPES)}")
+        if topic in found:
+            raise InputError(f"--tracks {value}: the topic {topic} is given twice")
         found[topic] = RESULT_TYPES[kind] if equals else None
     return found
 
@@ -78,10 +82,12 @@ class Ros2Node:
     ) -> None:
         inputs = {**dict.fromkeys(options.topics.values(), DETECTION_TYPES), **TRANSFORMS}
         if options.odometry is not None:
+            if options.odometry in inputs:
+                raise InputError(f"--odometry {options.odometry}: expected another topic than those of detections")
             inputs[options.odometry] = ODOMETRY_TYPES
         for topic in (*inputs, *results):
-            if not topic.startswith("/") or topic.endswith("/"):
-                raise InputError(f"{topic}: expected a topic that begins with a slash, as /detections")
+            if not _TOPIC.fullmatch(topic):
+                raise InputError(f"{topic!r}: expected a topic of letters, digits and _ after slashes, as /detections")
             if topic in results and topic in inputs:
                 raise InputError(f"{topic}: expected another topic for tracks than those that are read")
         self._stream, self._options, self._results = stream, options, results
@@ -149,7 +155,8 @@ class Ros2Node:
 
     @staticmethod
     def _say(logged: LoggedMessage, text: str) -> None:
-        log.warning("%s", text, extra={"topic": logged.topic.name})
+        kind = re.sub(r"[-+.\w]*\d[-+.\w]*", "", text)  # the fault without numbers
+        log.warning("%s", text, extra={"topic": (logged.topic.name, kind)})
 
     def _read(self, logged: LoggedMessage) -> None:
         """Take in one payload: transforms at once, objects to be placed."""

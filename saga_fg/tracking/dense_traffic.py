@@ -8,10 +8,11 @@ chosen on half of the windows of two recorded roads, and confirmed on the others
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 
-from saga_fg.model.edge_rules import Following, acting_classes
+from saga_fg.model.edge_rules import VEHICLES, Following
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.map_rules import GreenLight, RedLight, Stopping
 from saga_fg.model.motion import ConstantVelocity, Curvilinear
@@ -21,47 +22,51 @@ from saga_fg.types.by_class import DEFAULT
 from saga_fg.types.frame import Frame
 from saga_fg.types.road_map import SignalSettings
 
-DENSE_TRAFFIC = TrackerSettings(
-    classes={
-        DEFAULT: ClassSettings(
-            motion=Curvilinear(jerk_noise=0.3, fading_time=4.0, course_time=0.2),
-            initial_speed_deviation=8.0,
-            gate=0.99999,
-            initiation_score=0.3,
-            nms_distance=1.0,
-            max_distance=8.0,
-            max_deviation=3.0,
+
+@cache
+def dense_traffic_settings() -> TrackerSettings:
+    """Settings of the tracker for dense road traffic, of which nothing else is known."""
+    return TrackerSettings(
+        classes={
+            DEFAULT: ClassSettings(
+                motion=Curvilinear(jerk_noise=0.3, fading_time=4.0, course_time=0.2),
+                initial_speed_deviation=8.0,
+                gate=0.99999,
+                initiation_score=0.3,
+                nms_distance=1.0,
+                max_distance=8.0,
+                max_deviation=3.0,
+            ),
+            "pedestrian": ClassSettings(
+                motion=ConstantVelocity(acceleration_noise=0.3),
+                initial_speed_deviation=1.2,
+                initial_lateral_speed_deviation=1.2,
+                gate=0.99999,
+                initiation_score=0.3,
+                nms_distance=0.3,
+                max_distance=2.0,
+                max_deviation=1.5,
+            ),
+        },
+        min_hits=2,
+        traffic=TrafficSettings(memory=60.0),
+        edges=(
+            RedLight(interaction=Stopping(margin=0.5), reaction_deceleration=0.8, full_deceleration=1.8),
+            GreenLight(),
+            Following(  # parked: all are on the road, and who was never seen moving waits in a queue
+                interaction=SharedVelocity(along_heading=True),
+                rate=1.5,
+                max_gap=60.0,
+                gap_scale=16.0,
+                lateral_scale=0.8,
+                parked=True,
+            ),
         ),
-        "pedestrian": ClassSettings(
-            motion=ConstantVelocity(acceleration_noise=0.3),
-            initial_speed_deviation=1.2,
-            initial_lateral_speed_deviation=1.2,
-            gate=0.99999,
-            initiation_score=0.3,
-            nms_distance=0.3,
-            max_distance=2.0,
-            max_deviation=1.5,
-        ),
-    },
-    min_hits=2,
-    traffic=TrafficSettings(memory=60.0),
-    edges=(
-        RedLight(interaction=Stopping(margin=0.5), reaction_deceleration=0.8, full_deceleration=1.8),
-        GreenLight(),
-        Following(  # parked: all are on the road, and who was never seen moving waits in a queue
-            interaction=SharedVelocity(along_heading=True),
-            rate=1.5,
-            max_gap=60.0,
-            gap_scale=16.0,
-            lateral_scale=0.8,
-            parked=True,
-        ),
-    ),
-    edge_prior=0.95,  # edges answer for themselves: a leader who has crossed the line no longer leads
-    signals=SignalSettings(red_duration=70.0, amber_duration=3.5, green_duration=25.0, driver_noise=1.0),
-    association=AssociationSettings(clutter_area=5000.0),
-)
-"""Settings of the tracker for dense road traffic, of which nothing else is known."""
+        edge_prior=0.95,  # edges answer for themselves: a leader who has crossed the line no longer leads
+        signals=SignalSettings(red_duration=70.0, amber_duration=3.5, green_duration=25.0, driver_noise=1.0),
+        association=AssociationSettings(clutter_area=5000.0),
+    )
+
 
 FEWEST, LONGEST_STEP = 5, 0.3  # vehicles at a time; s between frames: leaders and trails matter from here on
 STANDING = 1.0  # m, within which a sensor stays that stands
@@ -76,7 +81,7 @@ def seems_dense_traffic(frames: Sequence[Frame]) -> str:
     poses = np.array([frame.world_T_ego[:2, 3] for frame in frames if frame.world_T_ego is not None]).reshape(-1, 2)
     if not detections or any(frame.coordinates != "world" and frame.world_T_ego is None for frame in frames):
         return ""
-    vehicles = [np.isin(boxes.label, sorted(acting_classes(DENSE_TRAFFIC.edges))) for boxes in detections]
+    vehicles = [np.isin(boxes.label, VEHICLES) for boxes in detections]
     headed = [np.isfinite(boxes.yaw[of]) for boxes, of in zip(detections, vehicles, strict=True)]
     count, times = float(np.median([of.sum() for of in vehicles])), np.unique([frame.timestamp for frame in frames])
     step = float(np.median(np.diff(times))) if len(times) > 1 else np.inf

@@ -14,7 +14,7 @@ from saga_fg.tables.column_names import TableImport
 from saga_fg.tables.columns import RawTable
 from saga_fg.tables.detections import Table, raw_table, scenes_of, table_like, tell
 from saga_fg.tables.plausibility import idle_rules
-from saga_fg.tracking.dense_traffic import DENSE_TRAFFIC, seems_dense_traffic
+from saga_fg.tracking.dense_traffic import dense_traffic_settings, seems_dense_traffic
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker import Tracker
 from saga_fg.types.by_class import DEFAULT
@@ -79,8 +79,10 @@ def fitting_settings(scenes: Sequence[Scene]) -> TrackerSettings:
     why = seems_dense_traffic(scenes[0].frames) if scenes else ""
     if not why:
         return TrackerSettings(min_hits=2)
-    warnings.warn(f"settings for dense traffic: {why}; settings=TrackerSettings() takes others", stacklevel=3)
-    return DENSE_TRAFFIC
+    warnings.warn(
+        f"settings for dense traffic: {why}; settings=TrackerSettings(min_hits=2) takes the plain ones", stacklevel=3
+    )
+    return dense_traffic_settings()
 
 
 def check_scenes(raw: RawTable, scenes: list[Scene], settings: TrackerSettings, sensors: Mapping[str, Sensor]) -> None:

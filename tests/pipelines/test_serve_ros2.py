@@ -233,8 +233,11 @@ def test_what_cannot_be_used_is_one_line_and_the_node_goes_on(monkeypatch, caplo
 
 
 def test_names_that_are_no_topics(monkeypatch):
-    with pytest.raises(InputError, match="tracks: expected a topic that begins with a slash"):
-        Published(monkeypatch, ("tracks",))
+    for name in ("tracks", "/a b", "/1", "//a", "/a/"):
+        with pytest.raises(InputError, match=f"'{name}': expected a topic of letters, digits and _ after slashes"):
+            Published(monkeypatch, (name,))
+    with pytest.raises(InputError, match="the topic /tracks is given twice"):
+        result_topics(["/tracks", "MarkerArray=/tracks"])
     with pytest.raises(InputError, match="/objects: expected another topic for tracks"):
         Published(monkeypatch, ("/objects",))
     with pytest.raises(InputError, match="TYPE=TOPIC with one of TrackedObjects, Detection3DArray, MarkerArray"):

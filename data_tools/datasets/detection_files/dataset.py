@@ -77,6 +77,12 @@ def read_scenes_in_parts(
             raise InputError(f"{path}: {unknown_name('scene', wanted, tuple(sorted({*done, name} - {''})))}")
 
 
+def dense_traffic_of(path: Path, how: TableImport) -> str:
+    """Why the first rows of a table look like dense road traffic, "" if they do not."""
+    first = next(read_scenes_in_parts(path, how=how), None)
+    return "" if first is None else seems_dense_traffic(first.frames)
+
+
 _ALL = Layout(tuple(dict.fromkeys((*COLUMNS, *TRACK_COLUMNS, SETTLED, "visible"))), REQUIRED, faulty=True)
 SHOWN = (*REQUIRED, *BOX, *POSE)
 GAP = 3.0  # usual steps, from which a pause counts
@@ -143,9 +149,8 @@ def survey_table(path: Path, how: TableImport | None = None) -> TableSurvey:
         try:
             table = DetectionTable(replace(ordered, columns={k: v for k, v in ordered.columns.items() if k in COLUMNS}))
             for name in table.scenes:
-                scene_of_table = table.scene(name)
-                findings += scene_of_table.findings or ()
-                dense = dense or seems_dense_traffic(scene_of_table.frames)
+                findings += table.scene(name).findings or ()
+            dense = dense_traffic_of(path, replace(how, sort=how.sort or not in_order))
         except InputError as error:
             faults.append(str(error).removeprefix(f"{path}: "))
     known = {finding.kind: finding for finding in reversed(findings)}

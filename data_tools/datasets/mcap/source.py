@@ -205,6 +205,8 @@ def sensor_topics(option: str, values: Iterable[str]) -> dict[str, str]:
             raise InputError(f"{option} {value}: expected a topic, or SENSOR=TOPIC")
         if sensor in topics:
             raise InputError(f"{option} {value}: the sensor {sensor} is given twice")
+        if topic in topics.values():
+            raise InputError(f"{option} {value}: the topic {topic} is given twice")
         topics[sensor] = topic
     return topics
 

@@ -127,6 +127,10 @@ def test_tables_that_cannot_be_used_are_refused(subtests):
         ([1, 2], r"expected a table of pandas, Polars or Arrow, got list"),
         (pd.DataFrame({"t": [1.0], "x": [1.0]}), r"expected a column 'y', the columns there are t, x"),
         (pd.DataFrame({"timestamp": [1.0], "x": ["far"], "y": [1.0]}), r"row 0: x: expected a number, got 'far'"),
+        (
+            pd.DataFrame({"timestamp": [1, 2], "x": [0.5, "far"], "y": [1, 1]}),
+            r"row 1: x: expected a number, got 'far'",
+        ),
         (pd.DataFrame({"timestamp": [1e30], "x": [1.0], "y": [1.0]}), r"timestamp"),
     ]:
         with subtests.test(message), pytest.raises(InputError, match=message):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from saga_fg import Tracker, TrackerSettings, track
-from saga_fg.tracking.dense_traffic import DENSE_TRAFFIC, seems_dense_traffic
+from saga_fg.tracking.dense_traffic import dense_traffic_settings, seems_dense_traffic
 from tests.saga_fg.traffic_frames import frame, run
 
 TIMES = np.arange(0.0, 2.0, 0.1)
@@ -57,7 +57,7 @@ def test_a_hidden_follower_brakes_with_its_leader():
     times = np.arange(0.0, 6.5, 0.1)
     frames = [frame(t, place(t)[: 9 if t > 4.0 else 10]) for t in times]
     errors = []
-    for settings in (DENSE_TRAFFIC, TrackerSettings(min_hits=2)):
+    for settings in (dense_traffic_settings(), TrackerSettings(min_hits=2)):
         tracker = Tracker(settings)
         run(tracker, frames)
         x = tracker.tracks(times[-1]).boxes.position[:, 0]
@@ -75,6 +75,6 @@ def test_a_table_of_it_is_tracked_with_its_settings():
     table = pandas.DataFrame(rows)
     with pytest.warns(UserWarning, match="settings for dense traffic: 6 vehicles"):
         found = track(table)
-    by_name = track(table, DENSE_TRAFFIC)
+    by_name = track(table, dense_traffic_settings())
     assert found.equals(by_name)
     assert not found.equals(track(table, TrackerSettings(min_hits=2)))
