@@ -128,12 +128,9 @@ class DetectionFileSource(DatasetSource):
         return own.over(self.table_import or TableImport())
 
     def dense_traffic(self) -> str:
-        """Why the settings for dense traffic fit, "" if they do not: `like`, or what the first rows look like.
-
-        Several tables have settings of their own only where `like` says so.
-        """
-        if self.like is not None or len(self.detections or ()) != 1 or not Path(self._table()).is_file():
-            return "--like dense" if self.like == "dense" else ""
+        """Why the first rows look like dense road traffic, "" if they do not, or are not those of one file here."""
+        if len(self.detections or ()) != 1 or not Path(self._table()).is_file():
+            return ""
         with local_copy(self._table()) as path:
             return dense_traffic_of(path, self.how)
 

@@ -83,8 +83,8 @@ def exchanged(result: SceneResult) -> SceneResult:
     return SceneResult(result.scene, found, coasting=None if result.coasting is None else result.coasting[rows])
 
 
-def write_for_tool(path: Path, tool: str, result: SceneResult) -> None:
-    """Write the boxes of a scene to a file or folder, with the suffix that the tool's files have."""
+def write_for_tool(path: Path, tool: str, result: SceneResult) -> int:
+    """Write the boxes of a scene to a file or folder with the suffix of the tool's files; return their number."""
     scene, found = result.scene, exchanged(result).found
     bounds = np.searchsorted(found.frame, np.arange(len(scene) + 1)).tolist()
     frames = []
@@ -94,6 +94,7 @@ def write_for_tool(path: Path, tool: str, result: SceneResult) -> None:
         numbers = np.column_stack([boxes.position, boxes.size, boxes.yaw]).tolist()
         frames.append(list(zip(mine.id.tolist(), boxes.label.tolist(), numbers, strict=True)))
     tool_format(tool).write(path, scene, frames)
+    return len(found)
 
 
 def read_from_tool(

@@ -109,16 +109,17 @@ class TrackerOptions:
 def family_of(source: DatasetSource, config: Path | None) -> str | Path:
     """The shipped settings that fit a dataset, which the file `config` lies over.
 
-    A table of dense traffic has its own, which is told, unless there is such a file: its meaning depends on no data.
+    A table has those that `--like` names. One of dense traffic has its own, which is told, unless there is such a file:
+    its meaning depends on no data.
     """
-    why = ""
-    if isinstance(source, DetectionFileSource) and (config is None or source.like is not None):
-        why = source.dense_traffic()
-    if not why:
+    if not isinstance(source, DetectionFileSource):
         return source.family
-    if not why.startswith("--"):
+    if source.like is not None:
+        return "dense" if source.like == "dense" else source.family
+    why = source.dense_traffic() if config is None else ""
+    if why:
         typer.echo(f"settings for dense traffic: {why}; --like plain takes others", err=True)
-    return "dense"
+    return "dense" if why else source.family
 
 
 @dataclass(frozen=True)

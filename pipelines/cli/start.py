@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import typer
 
@@ -14,7 +14,7 @@ from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from data_tools.simulator.settings import scenario_settings
 from pipelines.cli.console import counted, progress_bar, show_tables, working
 from pipelines.cli.options import Config, Verbose, as_command
-from pipelines.config import load_config
+from pipelines.config import Family, load_config
 from pipelines.configuration import load_settings, write_settings
 from pipelines.demo import comparison_table, run_demo, write_simulated_tables
 from pipelines.serving import StreamSettings
@@ -77,7 +77,8 @@ def _config(
         str,
         typer.Option(
             "--for",
-            help="Dataset whose shipped settings to print; or heterogeneous: traffic lights, cones, trailers.",
+            help="Dataset whose shipped settings to print; or heterogeneous: traffic lights, cones, trailers; or "
+            "dense: traffic seen from above or the roadside.",
             metavar="NAME",
         ),
     ] = "file",
@@ -112,7 +113,7 @@ def _config(
         settings = load_settings(cls, file) if file else cls()
     else:
         load = {"smoothing": load_smooth_config, "slam": load_slam_config, "tracking": load_config}[name]
-        family = kind if kind in ("heterogeneous", "dense") else dataset_source(kind).family
+        family = kind if kind in get_args(Family) else dataset_source(kind).family
         settings = load(family, file)
     text = write_settings(settings) if full else POINTER + write_settings(settings, selection=FIRST[name])
     typer.echo(text, nl=False)

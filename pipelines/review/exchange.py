@@ -39,8 +39,7 @@ def export_labels(folder: Path, run: LabelRun, tool: str, output: Path) -> tuple
         scans = source.surroundings(scenes).scans() if form.clouds else {}
         for result in labelled_scenes(folder, scenes):
             name = file_name(result.scene.name)
-            write_for_tool(whole / f"{name}{form.suffix}", tool, result)
-            boxes += len(exchanged(result).found)
+            boxes += write_for_tool(whole / f"{name}{form.suffix}", tool, result)
             for k, time in enumerate(result.scene.timestamps.tolist()):
                 points = ego_points(scans.get(result.scene.name), time)
                 if len(points):

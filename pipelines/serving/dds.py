@@ -61,7 +61,7 @@ class Ros2Network:
         self._wanted = wanted
         self.subscribed: dict[str, Topic] = {}
         self._readers: dict[str, Any] = {}
-        self._best_effort: set[str] = set()
+        self._reliable: set[str] = set()
         try:
             self._participant = DomainParticipant(int(domain))
         except DDSException as error:
@@ -101,21 +101,22 @@ class Ros2Network:
         if plain_type(type_) not in types:
             wanted = " or ".join(types)
             expected = f"expected messages of {wanted}"
-            log.warning("%s: %s, %s is published: left out", topic, expected, type_, extra={"topic": (topic, type_)})
+            log.warning("%s: %s, %s is published: left out", topic, expected, type_, extra={"kind": (topic, type_)})
             return
         best_effort = offered[Policy.Reliability] == Policy.Reliability.BestEffort
         if before is not None:
-            if best_effort and topic not in self._best_effort:
+            if best_effort and topic in self._reliable:
                 text = "%s: a publisher offers best effort, and the topic is subscribed reliably: left out"
-                log.warning(text, topic, extra={"topic": (topic, "best effort")})
-        else:
-            self._best_effort |= {topic} if best_effort else set()
-            reliability = Policy.Reliability.BestEffort if best_effort else Policy.Reliability.Reliable(BLOCKING)
-            quality = _quality(reliability, DEPTH, topic in TRANSIENT)
-            dds_topic = DdsTopic(self._participant, f"rt{topic}", _sample_type(type_))
-            self.subscribed[topic] = Topic(topic, plain_type(type_), 0)
-            self._readers[topic] = DataReader(self._participant, dds_topic, quality)
-            self._attach(self._readers[topic])
+                log.warning(text, topic, extra={"kind": (topic, "best effort")})
+            return
+        if not best_effort:
+            self._reliable.add(topic)
+        reliability = Policy.Reliability.BestEffort if best_effort else Policy.Reliability.Reliable(BLOCKING)
+        quality = _quality(reliability, DEPTH, topic in TRANSIENT)
+        dds_topic = DdsTopic(self._participant, f"rt{topic}", _sample_type(type_))
+        self.subscribed[topic] = Topic(topic, plain_type(type_), 0)
+        self._readers[topic] = DataReader(self._participant, dds_topic, quality)
+        self._attach(self._readers[topic])
 
     def _attach(self, reader: Any) -> None:
         any_state = SampleState.NotRead | ViewState.Any | InstanceState.Any

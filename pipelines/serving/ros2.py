@@ -156,7 +156,7 @@ class Ros2Node:
     @staticmethod
     def _say(logged: LoggedMessage, text: str) -> None:
         kind = re.sub(r"[-+.\w]*\d[-+.\w]*", "", text)  # the fault without numbers
-        log.warning("%s", text, extra={"topic": (logged.topic.name, kind)})
+        log.warning("%s", text, extra={"kind": (logged.topic.name, kind)})
 
     def _read(self, logged: LoggedMessage) -> None:
         """Take in one payload: transforms at once, objects to be placed."""

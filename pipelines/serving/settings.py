@@ -112,7 +112,7 @@ class LogLimit:
 
 
 class LogLimitFilter(logging.Filter):
-    """Limits the log lines of every line of code, for each `topic` of their records."""
+    """Limits the log lines of every line of code, for each `kind` of their records."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -120,4 +120,4 @@ class LogLimitFilter(logging.Filter):
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return True if this record may be logged."""
-        return self._limit.due((record.name, record.lineno, getattr(record, "topic", None)))
+        return self._limit.due((record.name, record.lineno, getattr(record, "kind", None)))

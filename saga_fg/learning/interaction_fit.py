@@ -22,11 +22,12 @@ from scipy.optimize import minimize
 
 from saga_fg.errors import InputError
 from saga_fg.learning.hidden_objects import GapPrediction, HiddenObjects
-from saga_fg.model.edge_rules import VEHICLES, Neighbours, traffic_rules
+from saga_fg.model.edge_rules import Neighbours, traffic_rules
 from saga_fg.model.interactions import CarFollowing
 from saga_fg.model.nonlinear_interactions import IntelligentDriver
 from saga_fg.numerics.arrays import FloatArray, StrArray
 from saga_fg.tracking import TrackerSettings
+from saga_fg.types.by_class import VEHICLES
 
 Rule = Any
 """An edge rule whose settings `rate` and `..._scale` are learned where they are finite."""

@@ -77,6 +77,7 @@ from saga_fg.settings import (
     setting,
     settings_group,
 )
+from saga_fg.types.by_class import VEHICLES
 
 CONES = ("traffic_cone", "barrier")  # classes of objects that form a line
 CLEARANCE = 1.75  # c, m, usual 1.5 to 2: half a vehicle and half a metre or more
@@ -159,7 +160,6 @@ def strongest(target: IntArray, rate: FloatArray, n: int, degree: int) -> IntArr
 
 
 Leaders = Literal["any", "moving", "stationary"]
-VEHICLES = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")
 
 
 class Pairs(NamedTuple):

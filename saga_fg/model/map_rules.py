@@ -61,7 +61,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from saga_fg.model.edge_rules import CLEARANCE, CONES, MIN_SPEED, VEHICLES, Pairs, anticipated, cones_ahead
+from saga_fg.model.edge_rules import CLEARANCE, CONES, MIN_SPEED, Pairs, anticipated, cones_ahead
 from saga_fg.model.interactions import (
     POSITION,
     VELOCITY,
@@ -83,6 +83,7 @@ from saga_fg.model.nonlinear_interactions import (
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
 from saga_fg.numerics.geometry import direction_at, feet, on_it, wrap_angle
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
+from saga_fg.types.by_class import VEHICLES
 from saga_fg.types.road_map import LANE, LIGHT, STOP_LINE, LanesAcross
 
 SIDE_BY_SIDE = 1.8  # m; vehicles that cross a line further apart are in different lanes

@@ -21,12 +21,12 @@ from saga_fg.errors import InputError
 from saga_fg.graph.factor_checks import Factor
 from saga_fg.graph.providers import Additions, GraphView
 from saga_fg.graph.variables import EGO_POSE, LANDMARK, MAP_NODE, OBJECT, NewVariable
-from saga_fg.model.edge_rules import VEHICLES
 from saga_fg.model.landmarks import PointLandmark
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.geometry import feet, on_it
 from saga_fg.providers.odometry import NO_POSE
 from saga_fg.settings import Positive, Settings, setting, settings_group
+from saga_fg.types.by_class import VEHICLES
 from saga_fg.types.frame import Observation
 from saga_fg.types.road_map import Lane
 

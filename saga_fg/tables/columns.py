@@ -263,9 +263,9 @@ class RawTable:
                 return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
             except (ValueError, OverflowError):
                 pass
-        given = [(row, value) for row, value in enumerate(values) if value is not None]
-        nonsense = (row for row, value in given if not _is_number(value, (str, int, float)))
-        row = next(nonsense, next((row for row, value in given if not _is_number(value, kinds)), 0))
+        given = [row for row, value in enumerate(values) if value is not None]
+        nonsense = [row for row in given if not _is_number(values[row], (str, int, float))]
+        row = (nonsense or [row for row in given if not _is_number(values[row], kinds)])[0]
         raise self.fault(row, f"{self.title(name)}: expected a number, got {str(values[row])[:40]!r}")
 
     def _yaw_of_quaternions(self, name: str) -> FloatArray:

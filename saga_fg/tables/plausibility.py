@@ -1,18 +1,20 @@
-"""Checks of detections and settings by their values: sizes, scores, times, names of classes.
+"""Checks of detections and settings by their values: sizes, scores, times, names of classes; and what they show.
 
-Each function returns a `Finding` or None. Thresholds are such that the recordings of the tests raise none.
+Checks return a `Finding` or None. Thresholds are such that the recordings of the tests raise none.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from difflib import get_close_matches
 
 import numpy as np
 
 from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.types.by_class import VEHICLES
 from saga_fg.types.dataset import FILL_IN, Finding, Mend
+from saga_fg.types.frame import Frame
 
 _WORDS = {
     "pedestrian": "pedestrian pedestrians person people human walker adult child",
@@ -201,3 +203,28 @@ def days_taken_for_times(time: FloatArray) -> Finding | None:
 def share(mask: BoolArray) -> float:
     """Share of a mask that is set, 0 of an empty one."""
     return float(np.mean(mask)) if len(mask) else 0.0
+
+
+TRAFFIC, LONGEST_STEP = 5, 0.3  # vehicles at a time; s between frames: leaders and trails matter from here on
+STANDING = 1.0  # m, within which a sensor stays that stands
+
+
+def seems_dense_traffic(frames: Sequence[Frame]) -> str:
+    """Why the frames of a recording, its first seconds perhaps, show dense road traffic; "" if they do not.
+
+    They do with five vehicles at a time, each with a heading, at 3 Hz or more, by a sensor that stays where it is.
+    """
+    detections = [frame.detections.boxes for frame in frames if len(frame.detections)]
+    poses = np.array([frame.world_T_ego[:2, 3] for frame in frames if frame.world_T_ego is not None]).reshape(-1, 2)
+    if not detections or any(frame.coordinates != "world" and frame.world_T_ego is None for frame in frames):
+        return ""
+    vehicles = [np.isin(boxes.label, VEHICLES) for boxes in detections]
+    headed = [np.isfinite(boxes.yaw[of]) for boxes, of in zip(detections, vehicles, strict=True)]
+    count, times = float(np.median([of.sum() for of in vehicles])), np.unique([frame.timestamp for frame in frames])
+    step = float(np.median(np.diff(times))) if len(times) > 1 else np.inf
+    stands = len(poses) == 0 or bool((np.ptp(poses, axis=0) <= STANDING).all())
+    if not stands or count < TRAFFIC or step > LONGEST_STEP:
+        return ""
+    if np.concatenate(vehicles).mean() <= 0.5 or np.concatenate(headed).mean() < 0.9:
+        return ""
+    return f"{count:.0f} vehicles at a time with headings, {1 / step:.3g} Hz, from a sensor that stands or hovers"

@@ -1,4 +1,4 @@
-"""Dense road traffic, seen by a sensor that stands or hovers: its settings, and how a recording shows that it is such.
+"""Dense road traffic, seen by a sensor that stands or hovers: its settings.
 
 Drones and roadside sensors give vehicles with headings, many at a time and often. There a vehicle keeps to its course,
 to the trails of those before it, and does what its leader does (`saga_fg.tracking.traffic`). The motion of vehicles was
@@ -7,19 +7,15 @@ chosen on half of the windows of two recorded roads, and confirmed on the others
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cache
 
-import numpy as np
-
-from saga_fg.model.edge_rules import VEHICLES, Following
+from saga_fg.model.edge_rules import Following
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.map_rules import GreenLight, RedLight, Stopping
 from saga_fg.model.motion import ConstantVelocity, Curvilinear
 from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
 from saga_fg.tracking.traffic import TrafficSettings
 from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.frame import Frame
 from saga_fg.types.road_map import SignalSettings
 
 
@@ -66,28 +62,3 @@ def dense_traffic_settings() -> TrackerSettings:
         signals=SignalSettings(red_duration=70.0, amber_duration=3.5, green_duration=25.0, driver_noise=1.0),
         association=AssociationSettings(clutter_area=5000.0),
     )
-
-
-FEWEST, LONGEST_STEP = 5, 0.3  # vehicles at a time; s between frames: leaders and trails matter from here on
-STANDING = 1.0  # m, within which a sensor stays that stands
-
-
-def seems_dense_traffic(frames: Sequence[Frame]) -> str:
-    """Why the frames of a recording, its first seconds perhaps, show dense road traffic; "" if they do not.
-
-    They do with five vehicles at a time, each with a heading, at 3 Hz or more, by a sensor that stays where it is.
-    """
-    detections = [frame.detections.boxes for frame in frames if len(frame.detections)]
-    poses = np.array([frame.world_T_ego[:2, 3] for frame in frames if frame.world_T_ego is not None]).reshape(-1, 2)
-    if not detections or any(frame.coordinates != "world" and frame.world_T_ego is None for frame in frames):
-        return ""
-    vehicles = [np.isin(boxes.label, VEHICLES) for boxes in detections]
-    headed = [np.isfinite(boxes.yaw[of]) for boxes, of in zip(detections, vehicles, strict=True)]
-    count, times = float(np.median([of.sum() for of in vehicles])), np.unique([frame.timestamp for frame in frames])
-    step = float(np.median(np.diff(times))) if len(times) > 1 else np.inf
-    stands = len(poses) == 0 or bool((np.ptp(poses, axis=0) <= STANDING).all())
-    if not stands or count < FEWEST or step > LONGEST_STEP:
-        return ""
-    if np.concatenate(vehicles).mean() <= 0.5 or np.concatenate(headed).mean() < 0.9:
-        return ""
-    return f"{count:.0f} vehicles at a time with headings, {1 / step:.3g} Hz, from a sensor that stands or hovers"

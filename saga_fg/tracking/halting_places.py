@@ -18,10 +18,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from saga_fg.model.edge_rules import VEHICLES
 from saga_fg.model.interactions import NodeTable, ahead_and_aside, unit
 from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, of_classes
 from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.types.by_class import VEHICLES
 
 STANDING = 0.6  # s
 STILL, LEAVES = 0.5, 1.5  # m/s: slower vehicles stand; from this speed on they have left

@@ -13,8 +13,8 @@ from saga_fg.model.sensor import Sensor, sensor_model
 from saga_fg.tables.column_names import TableImport
 from saga_fg.tables.columns import RawTable
 from saga_fg.tables.detections import Table, raw_table, scenes_of, table_like, tell
-from saga_fg.tables.plausibility import idle_rules
-from saga_fg.tracking.dense_traffic import dense_traffic_settings, seems_dense_traffic
+from saga_fg.tables.plausibility import idle_rules, seems_dense_traffic
+from saga_fg.tracking.dense_traffic import dense_traffic_settings
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker import Tracker
 from saga_fg.types.by_class import DEFAULT

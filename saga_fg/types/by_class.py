@@ -10,6 +10,7 @@ import numpy as np
 
 from saga_fg.numerics.arrays import FloatArray, StrArray, distinct
 
+VEHICLES = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")  # classes of road users with wheels
 DEFAULT = "default"  # key of the settings for every class that has none of its own
 S = TypeVar("S")
 _MAX_KEPT = 512  # tables of numbers; settings that are gone are kept as long

@@ -27,7 +27,7 @@ from saga_fg.tables.columns import (
     RawTable,
 )
 from saga_fg.tables.detections import DetectionTable, sorted_by_time
-from saga_fg.tracking.dense_traffic import seems_dense_traffic
+from saga_fg.tables.plausibility import seems_dense_traffic
 from saga_fg.types.dataset import Finding, Scene
 
 
