@@ -76,7 +76,7 @@ class KittiOptions:
     detections: Annotated[
         Path | None, typer.Option("--detections", help="Folder of a detector: Car/, Pedestrian/, Cyclist/.")
     ] = None
-    sequences: Annotated[str | None, typer.Option("--sequences", help="KITTI sequences, by commas; all.")] = None
+    scenes: Annotated[str | None, typer.Option("--scenes", help="KITTI sequences, by commas; all.")] = None
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def joint(
         ]
     else:
         found = KittiTracking(
-            kitti.dataroot, kitti.detections, None if kitti.sequences is None else kitti.sequences.split(","), True
+            kitti.dataroot, kitti.detections, None if kitti.scenes is None else kitti.scenes.split(","), True
         )
         many = [found.scene(name) for name in found.scenes]
     base = load_config("simulated" if kitti.dataroot is None else "kitti", config)

@@ -59,7 +59,7 @@ def found_results(
         dataset = DetectionTable(raw_table(detections, how))
     if truth is not None:
         raw = raw_table(truth, truth_how or how, TRUTH_COLUMNS, REQUIRED)
-        true = TruthTable(raw, partial(tell, depth=_DEPTH))
+        true = TruthTable.from_table(raw, partial(tell, depth=_DEPTH))
         dataset = true if dataset is None else DetectedTruth(true, dataset)
     return table_results(
         rows, Path(NAME), dataset, how=how, judged=truth is not None, own_times=truth is None and dataset is not None

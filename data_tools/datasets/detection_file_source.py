@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from data_tools.datasets import import_options
 from data_tools.datasets.detection_files import TableImport, TruthTable, read_tracks, read_truth
 from data_tools.datasets.detection_files.dataset import dense_traffic_of, read_detections, read_scenes_in_parts
-from data_tools.datasets.results import Results, SceneResult, clear_figures, table_results
+from data_tools.datasets.results import Results, SceneResult, clear_figures, nearest_rows, table_results
 from data_tools.datasets.source import (
     TRACKING,
     ChosenScenes,
@@ -170,7 +170,7 @@ class DetectionFileSource(DatasetSource):
             yield read_scenes_in_parts(path, scenes=chosen, how=self.how)
 
     def read_results(self, result: Path, truth: bool = True) -> Results:
-        return Results(self._results(result, truth), _score)
+        return Results(self._results(result, truth), score_tables)
 
     def _results(self, result: Path, truth: bool) -> Mapping[str, SceneResult]:
         rows = read_tracks(result, self.how, lenient=True)
@@ -221,7 +221,7 @@ class DetectionFileSource(DatasetSource):
         return (self.detections or [""])[0]
 
 
-def _score(
+def score_tables(
     scenes: Mapping[str, SceneResult], hota: bool = False, innovations: Mapping[str, FloatArray] | None = None
 ) -> Evaluation:
     """All figures that can be computed here."""
@@ -241,7 +241,8 @@ class NoScenes:
 class DetectedTruth:
     """The scenes of a table of true objects, with the frames of a table of detections.
 
-    Where one of them does not name its only scene, it is that of the other.
+    Where one of them does not name its only scene, it is that of the other. Where the truth has no poses of the
+    vehicle, they are those of the nearest moment of the detections.
     """
 
     def __init__(self, truth: TruthTable, detections: Dataset) -> None:
@@ -253,7 +254,16 @@ class DetectedTruth:
     def scene(self, name: str) -> Scene:
         """Read one of the scenes; raises `InputError` where a table does not have it."""
         true, detected = self._truth.scene(self._true_name.get(name, name)), self._detections.scene(name)
-        return replace(true, name=name, frames=detected.frames)
+        poses = true.world_T_ego
+        if not self._truth.posed and len(detected):
+            poses = detected.world_T_ego[nearest_rows(detected.timestamps, true.timestamps)]
+        return replace(
+            detected,
+            timestamps=true.timestamps,
+            world_T_ego=poses,
+            tokens=true.tokens,
+            ground_truth=true.ground_truth,
+        )
 
 
 @dataclass(frozen=True)

@@ -132,9 +132,9 @@ def _with_times(scene: Scene, rows: TrackRows) -> Scene:
     times = np.unique(rows.timestamp[rows.scene == scene.name])
     if not len(times) or not len(scene):
         return scene
-    new = times[np.abs(_nearest(scene.timestamps, times) - times) > _SAME_TIME]
+    new = times[np.abs(scene.timestamps[nearest_rows(scene.timestamps, times)] - times) > _SAME_TIME]
     order = np.argsort(np.append(scene.timestamps, new))
-    at = np.searchsorted(scene.timestamps, _nearest(scene.timestamps, new))
+    at = nearest_rows(scene.timestamps, new)
     return replace(
         scene,
         timestamps=np.append(scene.timestamps, new)[order],
@@ -151,7 +151,7 @@ def _at_moments(rows: TrackRows, scene: Scene, path: Path) -> TrackRows:
     if not len(times) or not len(scene):
         return rows.select(mine)
     step = float(np.median(np.diff(scene.timestamps))) if len(scene) > 1 else 1.0
-    nearest = _nearest(times, scene.timestamps)
+    nearest = times[nearest_rows(times, scene.timestamps)]
     near = np.abs(nearest - scene.timestamps) <= min(_NEAR_TIME, step / 4)
     within = (scene.timestamps >= times[0] - step) & (scene.timestamps <= times[-1] + step)
     if not near.any() or near[within].mean() < 0.5:
@@ -169,11 +169,11 @@ def _at_moments(rows: TrackRows, scene: Scene, path: Path) -> TrackRows:
     return replace(rows.select(mine[kept]), timestamp=moved[kept])
 
 
-def _nearest(times: FloatArray, moments: FloatArray) -> FloatArray:
-    """The nearest of ascending times to each moment."""
+def nearest_rows(times: FloatArray, moments: FloatArray) -> IntArray:
+    """The rows of the ascending times that are nearest to each moment."""
     after = np.minimum(np.searchsorted(times, moments), len(times) - 1)
     before = np.maximum(after - 1, 0)
-    return np.where(np.abs(moments - times[before]) <= np.abs(times[after] - moments), times[before], times[after])
+    return np.where(np.abs(moments - times[before]) <= np.abs(times[after] - moments), before, after)
 
 
 def _warn_of_classes(results: Mapping[str, SceneResult], path: Path, how: TableImport) -> None:

@@ -174,7 +174,7 @@ def test_tracks_at_moments_without_a_detection_beside_a_table(tmp_path: Path) ->
 
 
 def test_kitti_text_without_scores_is_sure_and_boxes_that_its_table_predicts_are_left_out(tmp_path: Path) -> None:
-    source, theirs = KittiSource(dataroot=str(write_sequence(tmp_path)), sequences="0007"), tmp_path / "theirs"
+    source, theirs = KittiSource(dataroot=str(write_sequence(tmp_path)), scenes="0007"), tmp_path / "theirs"
     theirs.mkdir()
     lines = [f"{k} 3 Car 0 0 -1.5 500 150 600 250 1.5 1.6 4 2 1.75 10 -1.5\n" for k in range(3)]
     (theirs / "0007.txt").write_text("".join(lines))

@@ -428,7 +428,7 @@ def test_kitti_sequences_in_parallel(recordings, tmp_path):
     kitti = recordings / "kitti"
     track = [
         *("track", "kitti", "--dataroot", kitti, "--detections", kitti / "detections" / "pointrcnn"),
-        *("--sequences", "0000,0017", "--method", "centerpoint"),
+        *("--scenes", "0000,0017", "--method", "centerpoint"),
     ]
     assert saga_fg(*track, "-o", tmp_path / "serial").exit_code == 0
     assert saga_fg(*track, "-o", tmp_path / "run", "--workers", "2").exit_code == 0

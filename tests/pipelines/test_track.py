@@ -362,9 +362,9 @@ def test_a_worker_fetches_its_sequence_alone(tmp_path, put):
     with local_kitti(url, f"{url}/found", ["0008"]) as dataset:
         assert dataset.scenes == ("0008",)
         assert [path.name for path in dataset.files("0008")[0].parent.iterdir()] == ["0008.txt"]
-    with SourcePart(KittiSource(dataroot=url, detections=f"{url}/found", sequences="0007"), "0007").opened() as there:
+    with SourcePart(KittiSource(dataroot=url, detections=f"{url}/found", scenes="0007"), "0007").opened() as there:
         digests = there.digests
-    local = KittiSource(dataroot=str(root), detections=str(root / "found"), sequences="0007")
+    local = KittiSource(dataroot=str(root), detections=str(root / "found"), scenes="0007")
     with SourcePart(local, "0007").opened() as here:
         assert digests == here.digests
 

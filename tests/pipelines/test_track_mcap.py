@@ -1,5 +1,7 @@
 """From a recording of ROS 2 or Foxglove to tracks in it, through the command; results are read by other libraries."""
 
+import json
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -152,7 +154,10 @@ def test_tracks_are_read_back_as_they_were(tmp_path, drive):
         assert saga_fg("track", "mcap", drive, "--output", tmp_path / f"tracks.{suffix}")[0] == 0
     recording = McapRecording(drive)
     scene = recording.scene("drive")
-    a, b = read_track_messages(tmp_path / "tracks.mcap", scene, {}), read_tracks(tmp_path / "tracks.csv")
+    a, b = (
+        read_track_messages(tmp_path / "tracks.mcap", scene.name, {}, scene.world),
+        read_tracks(tmp_path / "tracks.csv"),
+    )
     assert a.id.tolist() == b.id.tolist()
     assert a.timestamp == pytest.approx(b.timestamp, abs=1e-6)
     assert a.boxes.label.tolist() == b.boxes.label.tolist()
@@ -196,3 +201,60 @@ def test_without_the_extra_it_is_named(tmp_path, drive, monkeypatch):
     code, output = saga_fg("track", "mcap", drive, "--output", tmp_path / "tracks.mcap")
     assert code != 0
     assert "pip install 'saga-fg[mcap]'" in " ".join(output.split())
+
+
+def truth_table(path, shift=0.0):
+    """The objects of the drive as a table of truth; y moved by `shift` m."""
+    rows = [
+        f"{(START + k * STEP) / 1e9!r},{label},{label},{place[0]},{place[1] + shift}"
+        for k in range(MOMENTS)
+        for label, place, *_ in example.objects(k)
+    ]
+    path.write_text("\n".join(["time,id,label,x,y", *rows]) + "\n")
+    return path
+
+
+def test_tracks_are_judged_by_a_table_a_file_or_a_topic(tmp_path, drive):
+    tracks, figures = tmp_path / "tracks.mcap", tmp_path / "figures.json"
+    assert saga_fg("track", "mcap", drive, "--output", tracks)[0] == 0
+    table = truth_table(tmp_path / "truth.csv")
+    found = {}
+    for name, given in {
+        "table": ("--truth", table),
+        "table and recording": ("--truth", table, "--recording", drive),
+        "file": ("--truth", tracks),  # tracks are their own truth
+        "topic": ("--truth", TOPIC),
+        "tracked anew": ("--truth", table, "--recording", drive),
+    }.items():
+        result = () if name == "tracked anew" else (tracks,)
+        code, output = saga_fg("evaluate", "mcap", *result, *given, "--json", figures)
+        assert code == 0, output
+        found[name] = json.loads(figures.read_text())["sweep"]["overall"]
+    assert found["table"]["recall"] > 0.8
+    assert found["table"]["fp"] == 0
+    assert found["table and recording"] == found["tracked anew"] == found["table"]
+    for own in (found["file"], found["topic"]):
+        assert own["recall"] == 1
+        assert own["motp"] == pytest.approx(0, abs=1e-9)
+
+
+def test_a_truth_that_is_not_there_is_named(tmp_path, drive):
+    tracks = tmp_path / "tracks.mcap"
+    assert saga_fg("track", "mcap", drive, "--output", tracks)[0] == 0
+    code, output = saga_fg("evaluate", "mcap", tracks, "--truth", "/nowhere")
+    assert code == 2
+    assert f"expected a topic /nowhere with tracks, there are {TOPIC}" in " ".join(output.split())
+    code, output = saga_fg("evaluate", "mcap", tracks)
+    assert code == 2
+    assert "name it: --truth" in output
+
+
+def test_the_page_of_a_recording_shows_the_truth_of_a_table_and_the_recorded_path(tmp_path, drive):
+    tracks = tmp_path / "tracks.mcap"
+    assert saga_fg("track", "mcap", drive, "--output", tracks)[0] == 0
+    source = McapSource(recording=[str(drive)], truth=str(truth_table(tmp_path / "truth.csv")))
+    (result,) = source.read_results(tracks).scenes.values()
+    recorded = McapRecording(drive).scene("drive")
+    assert [len(each) for each in result.scene.ground_truth] == [len(example.objects(k)) for k in range(MOMENTS)]
+    assert result.scene.world_T_ego == pytest.approx(recorded.world_T_ego)
+    assert len(result.scene.frames) == len(recorded.frames)

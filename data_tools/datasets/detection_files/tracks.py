@@ -319,23 +319,43 @@ LONGEST_GAP = 2.5  # steps between rows of an object, for a velocity
 
 
 class TruthTable:
-    """The scenes of one table of true objects, with ground truth alone. `named`: whether the table names its scenes."""
+    """The scenes of one table of true objects, with ground truth alone.
 
-    def __init__(self, raw: RawTable, tell: Callable[[Sequence[Finding], RawTable], None] = _log_findings) -> None:
+    path  it is from, for errors
+    rows  in coordinates of the vehicle where `in_ego` (N,) is set
+    visible, pose, in_ego  of the rows: masks (N,), and x, y, z, yaw (N, 4) of the vehicle, NaN where unknown
+
+    Raises `InputError` without rows.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        rows: TrackRows,
+        visible: BoolArray | None = None,
+        pose: FloatArray | None = None,
+        in_ego: BoolArray | None = None,
+    ) -> None:
+        n = len(rows.id)
+        if not n:
+            raise InputError(f"{path}: expected at least one row, the table is empty")
+        self.path, self.rows, self.named = path, rows, rows.named
+        self._visible = np.ones(n, dtype=np.bool_) if visible is None else visible
+        self._pose = np.full((n, 4), np.nan) if pose is None else pose
+        self._in_ego = np.zeros(n, dtype=np.bool_) if in_ego is None else in_ego
+        self.posed = bool(np.isfinite(self._pose).all())
+        _, first = np.unique(rows.scene, return_index=True)
+        self.scenes: tuple[str, ...] = tuple(rows.scene[np.sort(first)].tolist())
+
+    @classmethod
+    def from_table(
+        cls, raw: RawTable, tell: Callable[[Sequence[Finding], RawTable], None] = _log_findings
+    ) -> TruthTable:
         """Check everything; tell as of `track_rows`. Raises `InputError` naming file, row and column."""
-        self.path = raw.path
-        self.rows = track_rows(raw, tell)
-        if not len(self.rows.id):
-            raise InputError(f"{raw.path}: expected at least one row, the table is empty")
-        kept = np.flatnonzero(~raw.labels()[1])
-        self._visible = _visible(raw)[kept]
-        self._pose = _poses(raw)[kept]
-        self._in_ego = (raw.texts("coordinates", raw.how.coordinates or "world") == "ego")[kept]
-        self._in_ego &= np.isfinite(self._pose).all(axis=1)
-        self._with_velocity = {"vx", "vy"} <= raw.columns.keys()
-        self.named = self.rows.named
-        _, first = np.unique(self.rows.scene, return_index=True)
-        self.scenes: tuple[str, ...] = tuple(self.rows.scene[np.sort(first)].tolist())
+        rows, kept, pose = track_rows(raw, tell), np.flatnonzero(~raw.labels()[1]), _poses(raw)
+        in_ego = raw.texts("coordinates", raw.how.coordinates or "world") == "ego"
+        in_ego &= np.isfinite(pose).all(axis=1)
+        return cls(raw.path, rows, _visible(raw)[kept], pose[kept], in_ego[kept])
 
     def scene(self, name: str) -> Scene:
         """One of the scenes; raises `InputError` for an unknown name and an object that is there twice at a time."""
@@ -345,7 +365,7 @@ class TruthTable:
         times, moment = np.unique(self.rows.timestamp[rows], return_inverse=True)
         poses = _scene_poses(self.rows, rows, moment, self._pose)
         boxes = _in_world(self.rows.boxes.select(rows), self._in_ego[rows], poses[moment])
-        if not self._with_velocity and len(times) > 1:
+        if np.isnan(boxes.velocity).all() and len(times) > 1:
             step = float(np.median(np.diff(times)))
             reach = max(1, round(REACH / step))
             ids = self.rows.id[rows]
@@ -360,7 +380,7 @@ class TruthTable:
 
 def read_truth(path: str | Path, how: TableImport | None = None) -> TruthTable:
     """Read a table of true objects. Raises `InputError` naming file, row and column."""
-    return TruthTable(read_raw_table(Path(path), Layout(TRUTH_COLUMNS, REQUIRED, lenient=True), how))
+    return TruthTable.from_table(read_raw_table(Path(path), Layout(TRUTH_COLUMNS, REQUIRED, lenient=True), how))
 
 
 def _scene_poses(rows: TrackRows, at: Sequence[int] | np.ndarray, moment: np.ndarray, pose: FloatArray) -> FloatArray:

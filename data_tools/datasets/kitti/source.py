@@ -28,7 +28,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -395,21 +395,18 @@ class KittiSource(DatasetSource):
     name = "kitti"
     written = KittiFormat()
     family = "kitti"
-    example = "--dataroot data/kitti --detections data/kitti/detections/pointrcnn --sequences 0000,0011"
+    example = "--dataroot data/kitti --detections data/kitti/detections/pointrcnn --scenes 0000,0011"
     shows = ("scans", "images")
     dataroot: str = option("Folder that holds training/, or oxts/, calib/ and, for scores, label_02/; or its URL.")
     detections: str | None = option(
         "Folder with Car/, Pedestrian/, Cyclist/, in each NNNN.txt; or its URL.", None, required=TRACKING
     )
-    sequences: str | None = option("Sequences with commas between them; all if left out.", None)
+    scenes: str | None = option("Names of sequences with commas between them; all if left out.", None)
 
     @contextmanager
     def open(self, truth: bool = False) -> Iterator[KittiTracking]:
         with local_kitti(self.dataroot, self.detections, self._chosen(), truth) as dataset:
             yield dataset
-
-    def restricted(self, scenes: Collection[str]) -> Self:
-        return replace(self, sequences=",".join(scenes))
 
     @contextmanager
     def parts(self) -> Iterator[Parts]:
@@ -438,4 +435,4 @@ class KittiSource(DatasetSource):
             return Results(scored_sequences(result, dataset), evaluate_kitti)
 
     def _chosen(self) -> tuple[str, ...] | None:
-        return None if self.sequences is None else names("--sequences", self.sequences)
+        return None if self.scenes is None else names("--scenes", self.scenes)

@@ -16,16 +16,18 @@ from typing import Any, BinaryIO, Literal, Self
 
 import numpy as np
 
-from data_tools.datasets.detection_files import TrackRows, read_tracks
+from data_tools.datasets.detection_file_source import JUDGED, DetectedTruth, score_tables
+from data_tools.datasets.detection_files import TableImport, TrackRows, TruthTable, read_tracks, read_truth
 from data_tools.datasets.mcap.dataset import McapRecording, RecordedScene, RecordingOptions, recorded_messages
 from data_tools.datasets.mcap.objects import OBJECT_TYPES, MessageObjects, message_objects
 from data_tools.datasets.mcap.recording import Recording
 from data_tools.datasets.mcap.ros2_types import definition, encoded
 from data_tools.datasets.mcap.transforms import DEFAULT_EGO
-from data_tools.datasets.results import Results, scene_result, table_results
+from data_tools.datasets.results import Results, table_results
 from data_tools.datasets.source import (
     TRACKING,
     DatasetSource,
+    HeldScene,
     OpenedPart,
     Parts,
     ResultFormat,
@@ -33,7 +35,7 @@ from data_tools.datasets.source import (
     file_digest,
     option,
 )
-from data_tools.files.file_access import atomic_file
+from data_tools.files.file_access import atomic_file, local_copy
 from saga_fg.errors import InputError, error_context
 from saga_fg.tables.column_names import pairs
 from saga_fg.types.boxes import Boxes
@@ -75,32 +77,39 @@ def _writer(file: BinaryIO, type_: str) -> tuple[Callable[[Any, int], None], Cal
     return lambda message, time: ros.add_message(channel, time, encoded(type_, message), time), ros.finish
 
 
-def read_track_messages(path: Path, scene: RecordedScene, classes: Mapping[str, str]) -> TrackRows:
-    """Tracks of one scene, of this or another tracker: of our topic or, where it is missing, the only one with objects.
+def read_track_messages(
+    path: Path, scene: str, classes: Mapping[str, str], world: str | None = None, topic: str | None = None
+) -> TrackRows:
+    """Tracks of one scene, of this or another tracker, or true objects.
 
-    Raises `InputError` naming file, topic, message and field; and for tracks in another frame than the scene's.
+    scene  its name, of all rows
+    world  frame that they are in; None: not checked
+    topic  None: our topic or, where it is missing, the only one with objects
+
+    Raises `InputError` naming file, topic, message and field; and for tracks in another frame.
     """
     recording = Recording(path)
     fit = [each.name for each in recording.topics.values() if each.type in OBJECT_TYPES]
-    if TOPIC not in fit and len(fit) != 1:
-        raise InputError(f"{path}: expected a topic {TOPIC} with tracks, there are {', '.join(fit) or 'none'}")
-    topic = TOPIC if TOPIC in fit else fit[0]
+    if topic is None:
+        topic = TOPIC if TOPIC in fit or len(fit) != 1 else fit[0]
+    if topic not in fit:
+        raise InputError(f"{path}: expected a topic {topic} with tracks, there are {', '.join(fit) or 'none'}")
     parts: list[MessageObjects] = []
     for logged in recorded_messages(recording, [topic]):
         with error_context(f"{path}: {topic}: message {logged.number}"):
             found = message_objects(logged.message, classes)
             if (found.id == "").any():
                 raise InputError(f"expected objects with ids, object {int(np.argmax(found.id == ''))} has none")
-            if len(found.id) and found.frame not in ("", scene.world.lstrip("/")):
+            if world is not None and len(found.id) and found.frame not in ("", world.lstrip("/")):
                 raise InputError(
-                    f"expected tracks in the frame {scene.world} of the recording, got {found.frame}; "
+                    f"expected tracks in the frame {world} of the recording, got {found.frame}; "
                     f"add --world {found.frame}, if they were tracked in it"
                 )
             parts.append(found)
     n = [len(each.id) for each in parts]
     none = np.empty((0, 2, 2))
     return TrackRows.from_columns(
-        np.full(sum(n), scene.name),
+        np.full(sum(n), scene),
         np.repeat([each.stamp / 1e9 for each in parts], n),
         np.concatenate([np.empty(0, dtype="<U1"), *(each.id for each in parts)]),
         Boxes.concatenate([each.detections.boxes for each in parts]),
@@ -137,6 +146,8 @@ class McapSource(DatasetSource):
     name = "mcap"
     written = McapFormat()
     has_truth = False
+    truth_option = "--truth"
+    summarised = True
     example = "drive.mcap --topic /perception/objects"
     recording: list[str] | None = option(
         "MCAP file or bag folder. In parallel: several of them.",
@@ -156,11 +167,28 @@ class McapSource(DatasetSource):
     odometry: str | None = option(
         "Topic of nav_msgs/Odometry for the pose of the vehicle; /tf if left out.", None, metavar="TOPIC"
     )
+    truth: str | None = option(
+        "True objects: a table with a row for each and moment, an MCAP file, or a topic of the recording, else of the "
+        "result.",
+        None,
+        metavar="FILE|TOPIC",
+        verbs=JUDGED,
+    )
     table: Literal["mcap", "csv", "ndjson"] = option("Format of the results, in parallel.", "mcap", verbs=("track",))
 
+    def __post_init__(self) -> None:
+        vars(self)["has_truth"] = self.truth is not None
+
     @contextmanager
-    def open(self, truth: bool = False) -> Iterator[McapRecording]:
-        yield McapRecording(self._one(), self._options())
+    def open(self, truth: bool = False) -> Iterator[Dataset]:
+        judged = truth and self.truth is not None
+        yield DetectedTruth(self._true_scenes(Path(self._one())), self.recorded()) if judged else self.recorded()
+
+    def recorded(self) -> McapRecording:
+        """The one recording. Raises `InputError` for several, and topics that are not there or hold no objects."""
+        topics = sensor_topics("--topic", self.topic or ())
+        options = RecordingOptions(topics, pairs("--classes", self.classes), self.world, self.ego, self.odometry)
+        return McapRecording(self._one(), options)
 
     @contextmanager
     def parts(self) -> Iterator[Parts]:
@@ -174,17 +202,31 @@ class McapSource(DatasetSource):
         return self if self.world is not None or "world" not in kept else replace(self, world=str(kept["world"]))
 
     def read_results(self, result: Path, truth: bool = True) -> Results:
-        with self.open() as dataset:
-            if result.suffix != ".mcap":
-                return Results(table_results(read_tracks(result, lenient=True), result, dataset, every_scene=True))
+        if truth and self.truth is not None and not self.recording:
+            rows = self._tracks(result, result.stem, self.world)
+            return Results(table_results(rows, result, self._true_scenes(result), judged=True), score_tables)
+        with self.open(truth) as dataset:
             (name,) = dataset.scenes
             scene = dataset.scene(name)
-            rows = read_track_messages(result, scene, pairs("--classes", self.classes))
-            return Results({name: scene_result(scene, rows, result)})
+        assert isinstance(scene, RecordedScene)
+        rows, judged = self._tracks(result, name, scene.world), scene.ground_truth is not None
+        return Results(table_results(rows, result, HeldScene(scene), every_scene=True, judged=judged), score_tables)
 
-    def _options(self) -> RecordingOptions:
-        topics = sensor_topics("--topic", self.topic or ())
-        return RecordingOptions(topics, pairs("--classes", self.classes), self.world, self.ego, self.odometry)
+    def _tracks(self, result: Path, scene: str, world: str | None) -> TrackRows:
+        if result.suffix != ".mcap":
+            return read_tracks(result, lenient=True)
+        return read_track_messages(result, scene, pairs("--classes", self.classes), world)
+
+    def _true_scenes(self, recorded: Path) -> TruthTable:
+        """The scene of --truth, which may be a topic of `recorded`."""
+        assert self.truth is not None
+        classes, path = pairs("--classes", self.classes), Path(self.truth)
+        if path.suffix == ".mcap":
+            return TruthTable(path, read_track_messages(path, path.stem, classes, self.world))
+        if self.truth.startswith("/") and not path.suffix:
+            return TruthTable(recorded, read_track_messages(recorded, recorded.stem, classes, self.world, self.truth))
+        with local_copy(self.truth) as table:
+            return read_truth(table, TableImport(classes=classes))
 
     def _one(self) -> str:
         if len(self.recording or ()) != 1:
@@ -226,7 +268,7 @@ class McapPart:
     @contextmanager
     def opened(self) -> Iterator[OpenedPart]:
         """Open with the digests of the files, and of the options."""
-        with self.source.open() as dataset:
-            digests = {file.name: file_digest(file) for file in dataset.files}
-            options = sha256(repr((dataset.options, self.source.table)).encode()).hexdigest()
-            yield OpenedPart({**digests, "options": options}, lambda: dataset)
+        dataset = self.source.recorded()
+        digests = {file.name: file_digest(file) for file in dataset.files}
+        options = sha256(repr((dataset.options, self.source.table)).encode()).hexdigest()
+        yield OpenedPart({**digests, "options": options}, lambda: dataset)
