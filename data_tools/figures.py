@@ -5,8 +5,9 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +99,20 @@ def write_figures(path: str | Path, figures: Any) -> None:
     write_text(path, json.dumps(as_json(figures), indent=1, allow_nan=False) + "\n")
 
 
-COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#e377c2", "#8c564b", "#637939", "#3949ab")
+COLOURS = ("#0b6bcb", "#d1495b", "#2a9d61", "#8e5bd0", "#e08a1e", "#1aa0b8", "#c2529a", "#7a5c48", "#6b7d1f", "#4453b8")
+_CLASSES = ("car", "pedestrian", "cyclist bicycle", "bus", "truck", "van", "motorcycle", "trailer")
+CLASS_COLOURS = {name: colour for names, colour in zip(_CLASSES, COLOURS, strict=False) for name in names.split()}
+
+
+def class_colours(labels: Iterable[str]) -> dict[str, str]:
+    """Return the colour of each class: its own, or in order one that no class with a colour of its own has.
+
+    The player, charts, figures and views in space all take these.
+    """
+    names = dict.fromkeys(labels)
+    own = {name: CLASS_COLOURS[name] for name in names if name in CLASS_COLOURS}
+    free = [colour for colour in COLOURS if colour not in own.values()] or COLOURS
+    return own | dict(zip((name for name in names if name not in own), cycle(free), strict=False))
 
 
 def new_figure(width: float, height: float, **options: Any) -> Any:

@@ -1,4 +1,4 @@
-const COLOURS = ["#0b6bcb", "#d1495b", "#2a9d61", "#8e5bd0", "#e08a1e", "#1aa0b8", "#c2529a", "#7a5c48", "#6b7d1f", "#4453b8"];
+let COLOURS, colourOf;  // of tracks in turn, and by the names of classes and series: those of all pictures
 
 function svg(name, attributes, text) {
   const element = document.createElementNS("http://www.w3.org/2000/svg", name);
@@ -33,13 +33,12 @@ function drawChart(chart) {
   plot.append(
     svg("text", {x: (left + W - right) / 2, y: H - 8, "text-anchor": "middle"}, chart.x_label),
     svg("text", {x: 12, y: (top + H - bottom) / 2, "text-anchor": "middle", transform: `rotate(-90 12 ${(top + H - bottom) / 2})`}, chart.y_label));
-  let colour = 0;
   chart.series.forEach(s => {
     if (chart.bars) {
       s.y.forEach((y, k) => plot.append(svg("rect", {x: px(s.x[k]), y: py(y), width: Math.max(px(s.x[k + 1]) - px(s.x[k]) - 1, .5), height: py(0) - py(y), fill: COLOURS[0]})));
       return;
     }
-    const stroke = s.faint ? "#aab4be" : COLOURS[colour++ % COLOURS.length];
+    const stroke = s.faint ? "#aab4be" : colourOf[s.name];
     plot.append(svg("polyline", {points: s.x.map((x, k) => `${px(x).toFixed(1)},${py(s.y[k]).toFixed(1)}`).join(" "), fill: "none", stroke, "stroke-width": s.faint ? 1 : 2, "stroke-dasharray": s.faint ? "4 4" : "none"}));
     if (!s.faint) plot.append(svg("text", {x: W - right - 4, y: H - bottom - 8 - 14 * (chart.series.length - 1 - chart.series.indexOf(s)), "text-anchor": "end", style: `fill:${stroke};font-weight:600`}, s.name));
   });

@@ -1,18 +1,9 @@
 // The rows that are shown, and the controls that choose them: classes, scores, confirmed, ghosts.
-const CLASS_COLOURS = {car: "#0b6bcb", pedestrian: "#d1495b", cyclist: "#2a9d61", bicycle: "#2a9d61", truck: "#e08a1e",
-  bus: "#8e5bd0", trailer: "#7a5c48", motorcycle: "#c2529a", van: "#1aa0b8"};
 const CONFIRMED = 3;  // moments at which a track was detected
-
-function coloursOf(scenes) {  // of all classes; those without a colour of their own get the free ones, in order of their names
-  const labels = [...new Set(scenes.flatMap(scene => scene.labels))].sort(), own = Object.entries(CLASS_COLOURS);
-  const taken = new Set(own.filter(([label]) => labels.includes(label)).map(([, colour]) => colour));
-  const free = COLOURS.filter(colour => !taken.has(colour)), others = labels.filter(label => !Object.hasOwn(CLASS_COLOURS, label));
-  return new Map([...own, ...others.map((label, at) => [label, free[at % free.length]])]);
-}
 
 function makeFilters(scenes, thresholds, ghosts, changed) {
   const state = {confirmed: true, ghosts, byTrack: false, off: new Set(), thresholds: {...thresholds}};
-  const counted = new Map(), colours = coloursOf(scenes), classColour = label => colours.get(label);
+  const counted = new Map(), classColour = label => colourOf[label] ?? SOFT;  // a correction may bring a new class
 
   function detectedMoments(result) {  // of each track of a result
     if (!counted.has(result)) {

@@ -26,7 +26,7 @@ import numpy as np
 from data_tools.datasets.detection_files import read_predictions
 from data_tools.datasets.results import Results
 from data_tools.datasets.source import DatasetSource
-from data_tools.figures import Chart, FigureTable, as_json
+from data_tools.figures import COLOURS, Chart, FigureTable, as_json, class_colours
 from data_tools.files.file_access import read_bytes, write_text
 from data_tools.files.readers import parsed_json
 from pipelines.config import load_config
@@ -64,9 +64,13 @@ class Report:
 
 def report_page(report: Report) -> str:
     """Return the HTML text."""
+    scenes = [scene_data(scene) for scene in report.scenes]
+    labels = sorted({label for scene in scenes for label in scene["labels"]})
     data = {
-        "scenes": [scene_data(scene) for scene in report.scenes],
+        "scenes": scenes,
         "charts": [asdict(chart) for chart in report.charts],
+        "colours": class_colours([*labels, *(series.name for chart in report.charts for series in chart.series)]),
+        "palette": COLOURS,
         "start": report.start,
         "ghosts": report.ghosts,
         "beside": report.beside,

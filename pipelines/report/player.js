@@ -321,6 +321,7 @@ function showImages(scene, k) {  // those of the cameras at a moment, as a strip
 }
 
 unpack($("data").textContent).then(data => {
+  COLOURS = data.palette; colourOf = data.colours;
   $("charts").append(...data.charts.map(drawChart));
   $("configuration").hidden = !$("configuration").querySelector("pre");
   $("player").hidden = !data.scenes.length;

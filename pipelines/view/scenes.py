@@ -36,7 +36,6 @@ Metres, about `origin`.
 
 from __future__ import annotations
 
-import colorsys
 import heapq
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -47,6 +46,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.source import DatasetSource
+from data_tools.figures import COLOURS, class_colours
 from data_tools.files.file_access import read_bytes
 from data_tools.files.readers import parsed_json
 from data_tools.lidar import read_scan, voxel_downsample
@@ -251,7 +251,8 @@ def _graphs(view: SceneView, origin: FloatArray, start: float) -> Iterator[Drawi
         when = float(graph["time"]) - start, moments.get(round(graph["time"], 3))
         yield Drawing(root, "graph/nodes", marks, *when)
         for number, kind in enumerate(kinds):
-            shape = Lines(lines.get(kind, []), one_colour(colour_of(number)), np.array([0.05]))
+            colour = one_colour(rgb(COLOURS[number % len(COLOURS)]))
+            shape = Lines(lines.get(kind, []), colour, np.array([0.05]))
             yield Drawing(root, f"graph/{re.sub('[^A-Za-z0-9]+', '_', kind)}", shape, *when)
 
 
@@ -279,14 +280,18 @@ class _Method:
     def __init__(self, table: SceneBoxes, origin: FloatArray, report: ReportScene) -> None:
         self._table, self._place = table, table.boxes.position - origin
         self._origin, self._time = origin, report.scene.timestamps
-        names, self._number = np.unique(table.id, return_inverse=True)
-        self._colour = np.array([colour_of(k) for k in range(len(names))], dtype=np.int64).reshape(-1, 3)
+        self._number = np.unique(table.id, return_inverse=True)[1]
+        colours = class_colours(
+            np.unique(np.concatenate([each.boxes.label for each in report.tracks.values()])).tolist()
+        )
+        labels = table.boxes.label.tolist()
+        self._colour = np.array([rgb(colours[label]) for label in labels], dtype=np.int64).reshape(-1, 3)
 
     def at(self, moment: int, edges: Edges) -> Iterator[tuple[str, Shape]]:
         """Yield the layers of a moment with their shapes."""
         table, place = self._table, self._place
         rows = np.flatnonzero(table.frame == moment)
-        colour = self._colour[self._number[rows]]
+        colour = self._colour[rows]
         boxes = table.boxes.select(rows)
         facts = {
             "id": table.id[rows].tolist(),
@@ -320,10 +325,10 @@ def ellipses(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     return size, np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
 
 
-def colour_of(number: int) -> Colour:
-    """Return a colour for a track's number; neighbours differ (the hues step by the golden ratio)."""
-    red, green, blue = colorsys.hsv_to_rgb(number * 0.618034 % 1.0, 0.65, 0.95)
-    return round(255 * red), round(255 * green), round(255 * blue)
+def rgb(colour: str) -> Colour:
+    """Return a colour that is given as #rrggbb."""
+    red, green, blue = bytes.fromhex(colour[1:])
+    return red, green, blue
 
 
 def _boxes(boxes: Boxes, origin: FloatArray, colour: IntArray, facts: Facts | None = None) -> Solids:

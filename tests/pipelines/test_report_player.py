@@ -16,6 +16,7 @@ from data_tools.datasets.nuscenes import NuScenes
 from data_tools.datasets.nuscenes.source import NuScenesSource
 from data_tools.datasets.source import clipped
 from data_tools.evaluation import best_thresholds, score_sweep
+from data_tools.figures import Chart, Series, class_colours
 from data_tools.metrics import SceneBoxes
 from pipelines.report import Report, ReportScene, report_page
 from pipelines.report.scenes import PLAIN, scene_data, start_thresholds, thumbnails
@@ -135,6 +136,21 @@ def test_classes_without_a_colour_of_their_own_get_free_ones(tmp_path):
     script = 'found.colours = [...$of("classes").children].map(each => each.style.getPropertyValue("--colour"));'
     found = tried_in_browser(page, HELPERS + script, tmp_path)
     assert len(found["colours"]) == len(set(found["colours"])) == len(names)
+
+
+def test_a_class_has_one_colour_in_player_charts_and_figures(tmp_path):
+    line = [0.0, 1.0]
+    chart = Chart("c", "x", "y", [Series(name, line, line) for name in ("bollard", "pedestrian", "all")])
+    page = report_page(Report("colours", [], [crowded(["pedestrian", "bollard"])], charts=[chart]))
+    script = """
+  for (const each of $of("classes").children) found[each.textContent] = [each.style.getPropertyValue("--colour")];
+  for (const each of $of("charts").querySelectorAll("text[style]")) (found[each.textContent] ??= []).push(each.style.fill);
+"""
+    found = tried_in_browser(page, HELPERS + script, tmp_path)
+    assert found["faults"] == []
+    for name, colour in class_colours(["bollard", "pedestrian"]).items():
+        assert found[name] == [colour, f"rgb({', '.join(map(str, bytes.fromhex(colour[1:])))})"]
+    assert found["all"][0] not in (found["bollard"][1], found["pedestrian"][1])
 
 
 def test_keys_work_after_a_click_on_a_control(tmp_path):
