@@ -281,11 +281,9 @@ class _Method:
         self._table, self._place = table, table.boxes.position - origin
         self._origin, self._time = origin, report.scene.timestamps
         self._number = np.unique(table.id, return_inverse=True)[1]
-        colours = class_colours(
-            np.unique(np.concatenate([each.boxes.label for each in report.tracks.values()])).tolist()
-        )
-        labels = table.boxes.label.tolist()
-        self._colour = np.array([rgb(colours[label]) for label in labels], dtype=np.int64).reshape(-1, 3)
+        labels = {label for each in report.tracks.values() for label in each.boxes.label.tolist()}
+        colours = class_colours(sorted(labels))
+        self._colour = np.array([rgb(colours[label]) for label in table.boxes.label.tolist()]).reshape(-1, 3)
 
     def at(self, moment: int, edges: Edges) -> Iterator[tuple[str, Shape]]:
         """Yield the layers of a moment with their shapes."""

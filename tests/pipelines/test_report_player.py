@@ -144,7 +144,8 @@ def test_a_class_has_one_colour_in_player_charts_and_figures(tmp_path):
     page = report_page(Report("colours", [], [crowded(["pedestrian", "bollard"])], charts=[chart]))
     script = """
   for (const each of $of("classes").children) found[each.textContent] = [each.style.getPropertyValue("--colour")];
-  for (const each of $of("charts").querySelectorAll("text[style]")) (found[each.textContent] ??= []).push(each.style.fill);
+  for (const each of $of("charts").querySelectorAll("text[style]"))
+    (found[each.textContent] ??= []).push(each.style.fill);
 """
     found = tried_in_browser(page, HELPERS + script, tmp_path)
     assert found["faults"] == []
