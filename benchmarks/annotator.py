@@ -25,11 +25,10 @@ import numpy as np
 from data_tools.evaluation import placed_detections
 from data_tools.metrics import SceneBoxes
 from data_tools.metrics.scene_boxes import nearest_pairs
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, wrap_angle
 from saga_fg.smoothing import LabelBuilder, Labels, Probabilities, RecordingLabels
 from saga_fg.smoothing.corrections import checked_corrections
-from saga_fg.types.dataset import Scene
+from saga_fg.types import Scene
 
 KEPT = 0.5
 GATE = 2.0  # m

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, checked
+from saga_fg.numerics import FloatArray, checked
 
 Statistic = Callable[[FloatArray], FloatArray]
 Comparison = Callable[[FloatArray, FloatArray], FloatArray]

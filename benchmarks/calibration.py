@@ -19,8 +19,7 @@ from data_tools.metrics import SceneBoxes, coverages, label_errors
 from pipelines.config import TrackConfig, load_config
 from pipelines.tracking import track_scene
 from saga_fg import Detections, Frame, InputError
-from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.dataset import Scene
+from saga_fg.types import DEFAULT, Scene
 
 DETECTED, SCORE = 0.9, 0.9
 SENSOR = "table"

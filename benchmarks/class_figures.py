@@ -24,8 +24,8 @@ from data_tools.datasets.nuscenes.source import in_range
 from data_tools.evaluation import PlacedBoxes, best_thresholds
 from data_tools.metrics import NuScenesTrackingScene, SceneBoxes, nuscenes_tracking_metrics
 from data_tools.metrics.scene_boxes import near_pairs, nearest_pairs
-from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
-from saga_fg.types.boxes import paired_bev_iou, touching_pairs
+from saga_fg.numerics import BoolArray, FloatArray, StrArray
+from saga_fg.types import paired_bev_iou, touching_pairs
 
 TWICE = 0.2
 LOW_SCORE = 0.1  # hidden objects at places that are hardly known have less

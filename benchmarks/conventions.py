@@ -27,8 +27,8 @@ from data_tools.datasets.detection_file_source import DetectionFileSource
 from pipelines.checks import CheckedDataset, Checks
 from pipelines.config import load_config
 from saga_fg import InputError
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.tables.detections import raw_table, scenes_of
+from saga_fg.numerics import FloatArray
+from saga_fg.tables import raw_table, scenes_of
 
 RATE, SECONDS, REACH = 10.0, 12.0, 60.0  # Hz, s, m
 NOISE, SPEED_NOISE, HEADING_NOISE, DETECTED = 0.15, 0.3, 0.05, 0.9  # m, m/s, rad, share

@@ -20,9 +20,8 @@ from scipy.spatial import cKDTree
 from benchmarks.scans import SENSOR_HEIGHT, SMALL, ScannerSettings, StaticWorld, simulate_scan
 from data_tools.lidar import Scan
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import transforms
-from saga_fg.types.boxes import Boxes
+from saga_fg.numerics import FloatArray, IntArray, transforms
+from saga_fg.types import Boxes
 
 NODES = 5  # crossings of the town in each direction
 _SPACING = (80.0, 120.0)  # m between streets

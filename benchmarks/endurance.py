@@ -27,10 +27,9 @@ import typer
 from benchmarks.runner import Row, Rows, Seed, chosen, clocked, each, only_errors, timed
 from pipelines.config import TrackConfig, load_config
 from pipelines.tracking import one_thread, resident_memory
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 from saga_fg.tracking import Tracker
-from saga_fg.types.boxes import MAX_POSITION, Boxes
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.types import MAX_POSITION, Boxes, Detections, Frame
 
 ESTIMATORS = ("kalman", "isam2", "fixed-lag")
 SHORTER = 4  # runs of the others than kalman, which take longer

@@ -38,8 +38,8 @@ from saga_fg.estimators import (
     rts_smooth,
 )
 from saga_fg.graph import OBJECT, Additions, GraphView, NewVariable
-from saga_fg.model.nonlinear_interactions import SmoothDriver
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.model import SmoothDriver
+from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.tracking import TrackerSettings
 
 KINDS: tuple[Kind, ...] = ("connected", "components")

@@ -30,7 +30,7 @@ import scipy.sparse
 from benchmarks.flocks import DT, Flock, FlockFrame
 from factors import gaussian_factors, interaction_factors, nonlinear_graph, prior_factors
 from saga_fg.estimators import Estimator, Gaussian, GraphFilter, kalman_predict, kalman_update
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics import FloatArray, IntArray
 
 Step = Callable[[], None]
 Read = tuple[FloatArray, FloatArray]  # newest means (n, 4) and covariances (n, 4, 4)

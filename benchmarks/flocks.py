@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 
 from saga_fg import ConstantVelocity, Edges, NodeType, SceneGraph
 from saga_fg.estimators import Measurements
-from saga_fg.model.discretisation import Transition, discretise
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.model import Transition, discretise
+from saga_fg.numerics import FloatArray, IntArray
 
 Kind = Literal["connected", "components"]
 

@@ -12,7 +12,7 @@ from benchmarks.gap_runs import LivedRun, Prediction
 from benchmarks.situations import SITUATIONS
 from data_tools.metrics import coverage
 from saga_fg.learning.labelled_scene import LENGTHS
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 
 PROBABILITIES = (0.5, 0.9)
 FEWEST_RECORDINGS, FEWEST_GAPS = 3, 5  # of an interval

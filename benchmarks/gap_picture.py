@@ -19,11 +19,11 @@ from benchmarks.gap_runs import LivedRun, judged_run, judgement
 from benchmarks.recording_sets import RecordingSet
 from benchmarks.situations import colours_at
 from data_tools.figures import COLOURS, png
-from data_tools.files.file_access import write_bytes
+from data_tools.files import write_bytes
 from pipelines.learning.gaps import CAP, Contender, JudgedRun
 from saga_fg.errors import InputError
 from saga_fg.learning.labelled_scene import Gap, LabelledScene
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 
 BEFORE, AFTER = 1.5, 1.0  # s
 MARGIN, HEIGHT = 12.0, 12.0  # m: before and after the object's way, and the least height of a panel

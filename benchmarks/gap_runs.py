@@ -23,9 +23,9 @@ from data_tools.metrics import nees
 from pipelines.learning.gaps import CAP, Contender, Errors, JudgedRun, classes_of, tracks_without
 from pipelines.tracking import Progress
 from saga_fg.learning.labelled_scene import LENGTHS, LONGEST, Gap, LabelledScene, is_moving, made_gaps, reached
-from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.types.dataset import Scene
+from saga_fg.model import Sensor
+from saga_fg.numerics import FloatArray
+from saga_fg.types import Scene
 
 SHORTEST = 1.0  # s: real gaps
 SEEN_BEFORE = 0.39  # s from the first to the last detection before a real gap: half a second of frames at 10 Hz

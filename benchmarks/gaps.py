@@ -34,7 +34,7 @@ from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learning import measured_trajectories
 from saga_fg.learning.labelled_scene import LENGTHS, Gap
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 
 FITS = ("noise", "edges")
 LEARNING = LearningSettings(passes=1, most=100)  # there is a fit to every fold, and a half of the usual tells enough

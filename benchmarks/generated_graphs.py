@@ -16,8 +16,7 @@ import gtsam
 import numpy as np
 from scipy.spatial import cKDTree
 
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import transforms
+from saga_fg.numerics import FloatArray, IntArray, transforms
 from saga_fg.slam.pose_graph import PoseGraph
 
 _NEAR, _BLOCK = 1.5, 5  # m, between poses of a city that see the same place; steps between crossings

@@ -14,13 +14,21 @@ from scipy.spatial import cKDTree
 
 from benchmarks.runner import Rows, in_turn
 from data_tools.datasets.kitti import kitti_scans
-from data_tools.lidar import SurfelMap, extract_walls, register, segment_ground, voxel_downsample
-from data_tools.lidar.places import PlaceImage, PlaceIndex, PlaceMatch
-from data_tools.lidar.registration import surfels_of
-from data_tools.lidar.scan import clusters_from_above, load_open3d
+from data_tools.lidar import (
+    PlaceImage,
+    PlaceIndex,
+    PlaceMatch,
+    SurfelMap,
+    clusters_from_above,
+    extract_walls,
+    load_open3d,
+    register,
+    segment_ground,
+    surfels_of,
+    voxel_downsample,
+)
 from pipelines.slam.odometry import LidarOdometry
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
+from saga_fg.numerics import FloatArray, inverse_transform, transform_points, yaw_transform
 
 _MAP, _SCAN, _SURFEL = 0.25, 1.5, 1.0  # m: spacings and voxels of LiDAR odometry
 _BEFORE, _EVERY = 12, 5  # scans that make a map, and steps between those compared

@@ -24,9 +24,8 @@ from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.slam.driver import SlamResult
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import inverse_transform, transforms, yaw_transform
-from saga_fg.types.boxes import Boxes
+from saga_fg.numerics import FloatArray, inverse_transform, transforms, yaw_transform
+from saga_fg.types import Boxes
 
 RATE, PERIOD, GRAVITY = 200, 0.1, 9.81  # samples a second; s between scans; m/s^2
 NOISE = np.repeat([0.02, 0.002], 3)  # densities: m/s^2 and rad/s per root Hz

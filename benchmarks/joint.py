@@ -38,10 +38,8 @@ from pipelines.config import TrackConfig, load_config
 from pipelines.slam.lidar_slam import path_tracker
 from saga_fg.errors import InputError
 from saga_fg.graph import EGO_POSE, Additions, GraphView
-from saga_fg.model.landmarks import PoleLandmark
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.assignment import Assignment, assign
-from saga_fg.numerics.geometry import inverse_transform, transform_points
+from saga_fg.model import PoleLandmark
+from saga_fg.numerics import Assignment, FloatArray, IntArray, assign, inverse_transform, transform_points
 from saga_fg.slam.joint import (
     JointSettings,
     OdometryIncrements,
@@ -51,9 +49,7 @@ from saga_fg.slam.joint import (
 from saga_fg.slam.joint.graph import ObjectStates
 from saga_fg.slam.joint.record import KEYFRAME_PERIOD, in_ego
 from saga_fg.slam.mapping import LandmarkObservations
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations, Scene
-from saga_fg.types.frame import Detections, Frame, Observation
+from saga_fg.types import Annotations, Boxes, Detections, Frame, Observation, Scene
 
 SENSOR = "lidar"
 NEAR, SETTLED, MOVING = 2.0, 3, 1.0  # m, of a detection from the object that it is of; frames; m/s

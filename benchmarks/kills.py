@@ -28,7 +28,7 @@ import numpy as np
 import typer
 
 from benchmarks.runner import PROGRAM, Rows, Seed, chosen, each
-from data_tools.files.file_access import LEFTOVER
+from data_tools.files import LEFTOVER
 from pipelines.scale_out.run import OF_THE_RUN
 
 RECORDINGS = (

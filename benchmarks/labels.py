@@ -29,8 +29,7 @@ from pipelines.config import Method, load_config
 from pipelines.smoothing import for_given_tracks, label_model, load_smooth_config, smooth_scene
 from pipelines.tracking import TrackedScene, track_scene
 from saga_fg.smoothing import LabelBuilder
-from saga_fg.types.dataset import Scene
-from saga_fg.types.track import Tracks
+from saga_fg.types import Scene, Tracks
 
 METHODS: tuple[Method, ...] = ("centerpoint", "kf")
 GRAPH: Method = "saga"

@@ -26,11 +26,9 @@ import numpy as np
 from benchmarks.landmark_merging import NearbyLandmarks, duplicates, place_of
 from factors import FactorError, SolverSettings, Variable, pose, residual_factor
 from saga_fg.errors import InputError, require_type
-from saga_fg.estimators.batch import BatchSolver
-from saga_fg.estimators.incremental_smoother import IncrementalSmoother
-from saga_fg.estimators.isam2_engine import RelinearisationSettings
+from saga_fg.estimators import BatchSolver, IncrementalSmoother, RelinearisationSettings
 from saga_fg.graph import Additions, GraphView
-from saga_fg.numerics.arrays import FloatArray, checked_covariances
+from saga_fg.numerics import FloatArray, checked_covariances
 from saga_fg.settings import Range, Settings, setting
 from saga_fg.slam.mapping import (
     AssociatedObservation,
@@ -43,7 +41,7 @@ from saga_fg.slam.mapping import (
 )
 from saga_fg.slam.mapping.local_map import POSE
 from saga_fg.slam.mapping.mapper import observation_factors
-from saga_fg.types.frame import Landmark, LandmarkType, Observation
+from saga_fg.types import Landmark, LandmarkType, Observation
 
 _MERGE_GATE = 1 - 1e-6  # gate probability of merging duplicates; near 1, since an outlier starts a duplicate
 _THRESHOLD = 1.0  # standard deviations that a variable moves before its factors are linearised anew

@@ -38,11 +38,10 @@ import numpy as np
 
 from factors import Vector
 from factors.manifolds import central_differences
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.assignment import gate
+from saga_fg.numerics import FloatArray, IntArray, gate
 from saga_fg.slam.mapping import LocalMap, log_odds
 from saga_fg.slam.mapping.local_map import initial_state
-from saga_fg.types.frame import Observation
+from saga_fg.types import Observation
 
 _SAME = 1e-6  # variance of the difference of a landmark from itself, for the numerics
 _SEEDS = 40  # pairs that sets are grown from, the likeliest

@@ -20,13 +20,13 @@ from benchmarks.recordings.landmarks import LandmarkLog, read_landmark_log
 from benchmarks.recordings.ranges import compared, map_beacons
 from benchmarks.runner import Rows, each
 from data_tools.figures import paths_from_above, png, write_figures
-from data_tools.files.file_access import atomic_directory, check_writable_folder, write_bytes
+from data_tools.files import atomic_directory, check_writable_folder, write_bytes
 from data_tools.trajectories import Trajectory, write_kitti_poses, write_tum_poses
 from pipelines.slam.results import landmark_row, landmark_rows, planar_trajectory
 from saga_fg.errors import InputError
-from saga_fg.model.landmarks import PointLandmark
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.types.frame import Observation
+from saga_fg.model import PointLandmark
+from saga_fg.numerics import FloatArray
+from saga_fg.types import Observation
 
 SCALES = (1.0, 4.0, 16.0, 64.0, 256.0)  # of the covariance, to choose of
 BEGINNING = 2000  # poses on which that is chosen

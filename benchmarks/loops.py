@@ -27,8 +27,7 @@ from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.slam.driver import SlamResult
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from saga_fg.errors import InputError, error_context
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, inverse_transform
 from saga_fg.slam.joint import OdometryIncrements, OdometryNoise
 from saga_fg.slam.pose_graph import (
     PoseGraph,

@@ -14,8 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from data_tools.lidar import voxel_downsample
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import transform_points
+from saga_fg.numerics import FloatArray, transform_points
 
 NEIGHBOURS = 8
 SPACING = 0.2  # m, of the map's points

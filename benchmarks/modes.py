@@ -21,9 +21,8 @@ from benchmarks.runner import Rows, Seed, each
 from pipelines.tracking import one_thread
 from saga_fg import ConstantVelocity, Edges, NodeType, SceneGraph
 from saga_fg.estimators import JointKalmanFilter, Measurements
-from saga_fg.model.discretisation import discretise
-from saga_fg.model.modes import Mixture, ModeTable, Stationary, mode_dynamics
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.model import Mixture, ModeTable, Stationary, discretise, mode_dynamics
+from saga_fg.numerics import FloatArray
 
 TITLE = "moments matched node by node, against every sequence of modes"
 FRAMES = {1: 10, 2: 6, 3: 4}  # by number of nodes: 1024 to 4096 sequences

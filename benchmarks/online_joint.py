@@ -16,13 +16,9 @@ import gtsam
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.estimators.batch import GraphSolution
-from saga_fg.estimators.incremental_smoother import IncrementalSmoother
-from saga_fg.estimators.isam2_engine import RelinearisationSettings
-from saga_fg.graph import Additions, FactorProvider, GraphError
-from saga_fg.graph.providers import Factors
-from saga_fg.numerics.arrays import FloatArray, checked_covariances
-from saga_fg.numerics.geometry import checked_transform, yaw_transform
+from saga_fg.estimators import GraphSolution, IncrementalSmoother, RelinearisationSettings
+from saga_fg.graph import Additions, FactorProvider, Factors, GraphError
+from saga_fg.numerics import FloatArray, checked_covariances, checked_transform, yaw_transform
 from saga_fg.slam.joint.association import SlowErrors, stationary_probabilities
 from saga_fg.slam.joint.graph import (
     JointEstimate,
@@ -35,7 +31,7 @@ from saga_fg.slam.joint.graph import (
 from saga_fg.slam.joint.record import MAX_ITERATIONS, EpochRecorder, JointSettings, RecordedEpoch
 from saga_fg.slam.mapping import Given, pose_key
 from saga_fg.tracking import Tracker
-from saga_fg.types.frame import Frame
+from saga_fg.types import Frame
 
 _SAME = 1e-3  # probability
 

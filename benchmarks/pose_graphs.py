@@ -18,7 +18,7 @@ from benchmarks.runner import Rows, each
 from data_tools.pose_graphs import read_g2o
 from factors import PlanarPose, SpatialPose, Vector, residual_factor, solve
 from saga_fg.errors import error_context
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 from saga_fg.slam.pose_graph import (
     PointLandmarks,
     PoseGraph,

@@ -43,7 +43,7 @@ from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.config import Family
 from pipelines.tracking import TrackedScene
 from saga_fg.errors import InputError
-from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types import Dataset, Scene
 
 VERSION = "v1.0-mini"
 Runs = Mapping[str, TrackedScene]

@@ -34,7 +34,7 @@ from pipelines.cli.console import JsonFile, MarkdownFile, error_console, new_gro
 from pipelines.cli.options import Verbose, as_command
 from pipelines.tracking import one_thread
 from saga_fg.errors import InputError, unknown_name
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 
 PROGRAM = (sys.executable, "-c", "from pipelines.cli.main import main; main()")  # the command, for other processes
 

@@ -26,8 +26,8 @@ from factors import (
 )
 from factors.validation import KeyArray
 from saga_fg.graph import EGO_POSE, OBJECT, Additions, FactorProvider, GraphView, NewVariable
-from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce, held
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.model import SmoothDriver, SocialForce, held
+from saga_fg.numerics import FloatArray
 
 INITIAL_POSE_COVARIANCE = np.diag([0.05, 0.05, 0.01]) ** 2
 ODOMETRY_COVARIANCE = np.diag([0.05, 0.03, 0.01]) ** 2

@@ -18,8 +18,7 @@ from benchmarks.filters import Filter, JointGraphTracking, Ours, SeparateGraphTr
 from benchmarks.flocks import DT, FlockFrame, flock
 from benchmarks.runner import Rows, Seed, counts, each, in_turn
 from saga_fg.estimators import JointKalmanFilter, Measurements
-from saga_fg.model.discretisation import discretise
-from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.model import SceneGraph, discretise
 
 NODES, JOINT, SEPARATE, APART = "nodes", "nodes and edges", "nodes and edges, each apart", "independent"
 HIDDEN_FOR, SHARES, MIXING = 20, 5, 0.35  # frames; parts of the objects, hidden one after the other; see `flock`

@@ -27,13 +27,20 @@ import gtsam
 import numpy as np
 
 from data_tools.datasets.mcap.ros2_types import definition, header
-from data_tools.files.file_access import write_text
+from data_tools.files import write_text
 from data_tools.laser import LaserLog
-from data_tools.lidar import Scan, constant_velocity
-from data_tools.lidar.scan import ScanSequence
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
-from saga_fg.numerics.geometry import inverse_transform, transforms, wrap_angle, yaw_transform
-from saga_fg.types.boxes import Boxes
+from data_tools.lidar import Scan, ScanSequence, constant_velocity
+from saga_fg.numerics import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    checked,
+    inverse_transform,
+    transforms,
+    wrap_angle,
+    yaw_transform,
+)
+from saga_fg.types import Boxes
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,7 @@ from benchmarks.sampled_traffic import (
 )
 from pipelines.tracking import one_thread
 from saga_fg.estimators import BatchSolver, IncrementalSmoother
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 
 TITLE = "the incremental smoother against Levenberg-Marquardt on the whole graph"
 MIXED, EVADING, STRAIGHT = "mixed", "crossing, evading", "crossing, straight on"

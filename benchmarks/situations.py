@@ -22,10 +22,8 @@ import numpy as np
 
 from saga_fg.learning.interaction_fit import ROAD_USERS
 from saga_fg.learning.labelled_scene import MOVING, Gap, LabelledScene, reached
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import feet, wrap_angle
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.road_map import Lane, LanesAcross, RoadMap, StopLine
+from saga_fg.numerics import FloatArray, feet, wrap_angle
+from saga_fg.types import Boxes, Lane, LanesAcross, RoadMap, StopLine
 
 STEP = 0.5  # m between points: shorter ones are noise
 ONWARD = 80.0  # m beyond the last label

@@ -35,18 +35,16 @@ from benchmarks.map_sharpness import scan_to_map_residual
 from benchmarks.runner import Row, Rows, Seed, clocked, each, in_turn, timed
 from benchmarks.scans import ScannerSettings
 from data_tools.datasets.kitti import kitti_scans
-from data_tools.lidar import Scan, constant_velocity, deskewed
-from data_tools.lidar.scan import ScanSequence
+from data_tools.lidar import Scan, ScanSequence, constant_velocity, deskewed
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.slam.lidar_slam import LidarSlam
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
 from pipelines.slam.vehicle_sensors import Vehicle
 from pipelines.tracking import one_thread, peak_memory
 from saga_fg.errors import InputError, MissingExtraError
-from saga_fg.model.landmarks import PointLandmark
-from saga_fg.numerics.arrays import BoolArray, FloatArray
-from saga_fg.numerics.geometry import inverse_transform
-from saga_fg.types.frame import Observation
+from saga_fg.model import PointLandmark
+from saga_fg.numerics import BoolArray, FloatArray, inverse_transform
+from saga_fg.types import Observation
 
 OURS, KISS = "saga-fg", "kiss-icp"
 SETTINGS = OdometrySettings()

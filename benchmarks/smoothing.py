@@ -19,7 +19,7 @@ from data_tools.simulator import SimulatedTraffic
 from pipelines.cli.options import Config
 from pipelines.smoothing import load_smooth_config
 from pipelines.tracking import one_thread
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.smoothing import (
     Evidence,
     SmoothingSettings,
@@ -31,7 +31,7 @@ from saga_fg.smoothing import (
 )
 from saga_fg.smoothing.passes import Passes
 from saga_fg.tracking import TrackerSettings
-from saga_fg.types.dataset import Scene
+from saga_fg.types import Scene
 
 NEAR = 2.0  # largest distance between a detection and its true object, m
 SPREAD = 0.3  # of a detection about its true object, besides the sensor's noise, m

@@ -28,11 +28,9 @@ from benchmarks.recording_sets import recording_set
 from benchmarks.runner import Data, Row, Rows, Seed, counts, growth, in_turn
 from benchmarks.service.round_trip import round_trips
 from pipelines.config import Method, TrackConfig, load_config
-from saga_fg.model.edge_rules import Neighbours
-from saga_fg.model.interactions import SharedVelocity
+from saga_fg.model import Neighbours, SharedVelocity
 from saga_fg.tracking import Stage, TrackerView
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.types import Boxes, Detections, Frame
 
 Ties = Literal["loose", "dense"]
 INTERVAL, SPEED, NOISE, DETECTED = 0.1, 12.0, 0.15, 0.9  # s, m/s, m, share

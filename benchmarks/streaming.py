@@ -22,7 +22,7 @@ from data_tools.datasets.detection_files import read_detections, read_scenes_in_
 from pipelines.smoothing import load_smooth_config, smooth_scene, smooth_stream, write_labels
 from pipelines.tracking import one_thread, peak_memory, resident_memory
 from saga_fg.smoothing import ChunkSettings, Labels
-from saga_fg.types.dataset import Scene
+from saga_fg.types import Scene
 
 PLATOON, GAP = 5, 15.0  # cars, and m between them
 ROADS, APART = 400, 1000.0  # side by side, m apart: platoons do not meet

@@ -17,12 +17,18 @@ from pipelines.config import METHODS, Method, TrackConfig
 from pipelines.configuration import load_settings
 from pipelines.learning.gaps import Contender
 from saga_fg.errors import InputError
-from saga_fg.model.edge_rules import EdgeRule, Following, Neighbours
-from saga_fg.model.map_rules import GreenLight, RedLight
-from saga_fg.model.motion import ConstantVelocity, RandomWalk
-from saga_fg.model.turning import CoordinatedTurn
+from saga_fg.model import (
+    ConstantVelocity,
+    CoordinatedTurn,
+    EdgeRule,
+    Following,
+    GreenLight,
+    Neighbours,
+    RandomWalk,
+    RedLight,
+)
 from saga_fg.tracking import ClassSettings
-from saga_fg.types.by_class import class_settings
+from saga_fg.types import class_settings
 
 Classes = Mapping[str, ClassSettings]
 

@@ -5,8 +5,6 @@ from data_tools.conformance import check_dataset
 check_dataset(Square(folder="recordings"))
 """
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 
@@ -18,7 +16,7 @@ from data_tools.metrics import SceneBoxes
 from saga_fg import Tracker
 from saga_fg.conformance.parts import boxes, require, same
 from saga_fg.parts import KINDS
-from saga_fg.types.dataset import Annotations, Scene
+from saga_fg.types import Annotations, Scene
 
 
 def check_dataset(source: DatasetSource, scenes: int = 2) -> None:

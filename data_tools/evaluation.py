@@ -15,8 +15,6 @@ The squared distance in sigmas of a track and the detection it took has 2 degree
 covariances are right. What lies outside the gate is never matched, which lowers the mean by little.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -47,11 +45,9 @@ from data_tools.metrics import (
 )
 from data_tools.metrics.hota import Similarity
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics import FloatArray, IntArray, StrArray
 from saga_fg.parts import new_part, of_own_code, part_kind
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Scene
-from saga_fg.types.track import html_table, text_table
+from saga_fg.types import Boxes, Scene, html_table, text_table
 
 __all__ = [
     "Evaluation",

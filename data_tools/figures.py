@@ -1,7 +1,5 @@
 """Figures and pictures: tables of texts, charts as numbers, JSON with null for undefined numbers, and plots."""
 
-from __future__ import annotations
-
 import io
 import json
 import math
@@ -13,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.files.file_access import write_text
-from saga_fg.numerics.arrays import FloatArray
+from data_tools.files import write_text
+from saga_fg.numerics import FloatArray
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,13 @@ tilt; its world box stands on the same centre with the heading's horizontal dire
 M being the horizontal part of the map of the heading. M is invertible, so the way back is exact.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
-from saga_fg.numerics.geometry import inverse_transform, wrap_angle
-from saga_fg.types.boxes import Boxes
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, inverse_transform, wrap_angle
+from saga_fg.types import Boxes
 
 _NO_BOX = -999.0  # positions below: the object has no 3D box
 

@@ -23,8 +23,6 @@ m and rad. I is the upper triangle of an information matrix, row by row, ordered
 EDGE_SE2_PRIOR is another spelling of EDGE_PRIOR_SE2.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -32,19 +30,24 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.files.file_access import write_text
-from data_tools.files.readers import LARGEST, TextTable, read_lines
+from data_tools.files import LARGEST, TextTable, read_lines, write_text
 from saga_fg.errors import InputError, unknown_name
-from saga_fg.numerics import geometry
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import adjoint, quaternion_norms, quaternion_rotation, rotation_quaternion
+from saga_fg.numerics import (
+    FloatArray,
+    IntArray,
+    adjoint,
+    geometry,
+    quaternion_norms,
+    quaternion_rotation,
+    rotation_quaternion,
+)
 from saga_fg.slam.pose_graph import (
     PointLandmarks,
     PoseGraph,
     PosePriors,
     PositionPriors,
 )
-from saga_fg.types.boxes import MAX_POSITION
+from saga_fg.types import MAX_POSITION
 
 _UNIT = 1e-3  # what the norm of a quaternion may be off 1
 _SLIGHT = 1e-4  # share of the largest eigenvalue by which the smallest may be negative: four digits are rounded so

@@ -11,8 +11,6 @@ rad. Rows are in order of time. Latitude and longitude become metres east and no
 projection at its scale (as KITTI's development kit does). Accelerations are specific forces: (0, 0, 9.81) at rest.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import re
@@ -23,11 +21,11 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.datasets.kitti.dataset import FRAME_PERIOD, read_sensors, world_position
-from data_tools.files.readers import LARGEST, TextTable, read_lines
+from data_tools.files import LARGEST, TextTable, read_lines
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, checked
+from saga_fg.numerics import FloatArray, checked
 from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings
-from saga_fg.types.frame import EgoMeasurements
+from saga_fg.types import EgoMeasurements
 
 _AXES = ("x", "y", "z")
 _TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}

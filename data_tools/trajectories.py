@@ -35,8 +35,6 @@ Seconds and metres; lines that start with # are comments. Source: Sturm et al., 
 SLAM systems, IROS 2012; https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Self, get_args
@@ -45,11 +43,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from data_tools.files.file_access import write_text
-from data_tools.files.readers import read_table
+from data_tools.files import read_table, write_text
 from saga_fg.errors import InputError, error_context
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
-from saga_fg.numerics.geometry import inverse_transform, is_rotation, quaternion_norms, quaternion_rotation
+from saga_fg.numerics import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    checked,
+    inverse_transform,
+    is_rotation,
+    quaternion_norms,
+    quaternion_rotation,
+)
 
 __all__ = [
     "Alignment",

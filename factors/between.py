@@ -31,8 +31,6 @@ mounted upright (Groves, Principles of GNSS, Inertial, and Multisensor Integrate
 section 4.4.1), the scale that of a wheel odometer (section 6.3).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

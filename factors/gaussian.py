@@ -43,8 +43,6 @@ GTSAM Jacobian factors: nothing calls back into Python while a solver runs. A no
 x_i(t+dt) = f( x_i(t), [x_j(t)], dt ) + q_i, is a residual of `factors.ResidualFactors`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -20,8 +20,6 @@ The truncation error is h^2 f''' / 6, the rounding error eps |f| / h; with |f| l
 balances them, leaving about 1e-10 near the origin and 1e-8 a kilometre away.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol

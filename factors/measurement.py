@@ -33,8 +33,6 @@ between bodies of N-body simulations are softened within a radius in this way (H
 Supplement 70, 1989, appendix A).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol

@@ -16,8 +16,6 @@ over nothing unchecked; whatever goes wrong in a user's function travels through
 `ISAM2.update` leaves that object unusable.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any

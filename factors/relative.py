@@ -25,8 +25,6 @@ by GTSAM's `OrientedPlane3Factor` (Trevor, Rogers and Christensen, "Planar surfa
 2012), which takes whatever four numbers it is given for a plane.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

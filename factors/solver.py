@@ -20,8 +20,6 @@ which damps a step that overshoots without turning it away from where sharp fact
 next step is short: its length in posterior standard deviations is sqrt(delta^T H delta), which knows no units.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

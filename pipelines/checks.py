@@ -3,8 +3,6 @@
 A table whose contents contradict how it is read is refused.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -15,15 +13,11 @@ import numpy as np
 from data_tools.datasets.source import DatasetSource
 from pipelines.config import TrackConfig
 from saga_fg import Curvilinear, Dataset, Frame, InputError, Scene, TrackerSettings, Tracks
-from saga_fg.model.edge_rules import acting_classes
-from saga_fg.model.sensor import sensor_model
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.tables.conventions import Sample, findings_of
-from saga_fg.tables.plausibility import idle_lanes, idle_rules, settings_without_data
-from saga_fg.tracking.by_name import estimator_parameters
-from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.dataset import Finding, Mend, refuse_contradictions
-from saga_fg.types.road_map import LANE, MAP_CLASSES, STOP_LINE
+from saga_fg.model import acting_classes, sensor_model
+from saga_fg.numerics import FloatArray
+from saga_fg.tables import Sample, findings_of, idle_lanes, idle_rules, settings_without_data
+from saga_fg.tracking import estimator_parameters
+from saga_fg.types import DEFAULT, LANE, MAP_CLASSES, STOP_LINE, Finding, Mend, refuse_contradictions
 
 log = logging.getLogger(__name__)
 

@@ -12,12 +12,10 @@ from typing import Literal, get_args
 from pipelines.configuration import load_settings, read_settings
 from saga_fg import ConstantVelocity, Curvilinear, GreedyTracker, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.errors import unknown_name
-from saga_fg.model.edge_rules import Following, Neighbours
-from saga_fg.model.stability import LearnedInteractions
+from saga_fg.model import Following, LearnedInteractions, Neighbours
 from saga_fg.settings import settings_group
-from saga_fg.tracking import AssociationName, ClassSettings, GreedySettings, Observer
-from saga_fg.tracking.dense_traffic import dense_traffic_settings
-from saga_fg.types.by_class import DEFAULT, class_settings
+from saga_fg.tracking import AssociationName, ClassSettings, GreedySettings, Observer, dense_traffic_settings
+from saga_fg.types import DEFAULT, class_settings
 
 Method = Literal["saga", "kf", "centerpoint"]
 METHODS: tuple[Method, ...] = get_args(Method)

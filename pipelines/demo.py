@@ -1,7 +1,5 @@
 """The demo: simulated traffic, several trackers compared, a table and a page."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.figures import FigureTable, cell
-from data_tools.files.file_access import atomic_directory, write_text
+from data_tools.files import atomic_directory, write_text
 from data_tools.metrics import SceneMetrics, scene_metrics
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from data_tools.simulator.source import write_tables
@@ -18,7 +16,7 @@ from pipelines.configuration import write_settings
 from pipelines.report import Report, report_page, scene_of_run
 from pipelines.tracking import Progress, TrackedScene, track_scene
 from saga_fg import Dataset, InputError, Scene
-from saga_fg.numerics.arrays import IntArray
+from saga_fg.numerics import IntArray
 
 __all__ = [
     "DemoResult",

@@ -15,7 +15,7 @@ from data_tools.datasets.results import SceneResult, scene_result
 from data_tools.datasets.source import DatasetSource
 from data_tools.evaluation import placed_detections
 from data_tools.figures import FigureTable, cell, write_figures
-from data_tools.files.file_access import write_text
+from data_tools.files import write_text
 from data_tools.metrics import SceneBoxes, coverages
 from data_tools.metrics.labels import (
     CommonBoxes,
@@ -31,7 +31,7 @@ from pipelines.report.page import RunRecord, write_run_record
 from pipelines.smoothing import SmoothConfig
 from pipelines.tracking import Progress, track_scene
 from saga_fg import Dataset, InputError, Scene
-from saga_fg.model.sensor import sensor_model
+from saga_fg.model import sensor_model
 
 if TYPE_CHECKING:
     from data_tools.evaluation import Evaluation

@@ -5,8 +5,6 @@ Journals of tracking: written by the tracker, read back and explained track by t
 A journal lies beside the result it belongs to, `RESULT.journal.jsonl`, an event (`saga_fg.tracking.journal`) a line.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -15,13 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from data_tools.figures import FigureTable, count
-from data_tools.files.file_access import atomic_file, open_bytes
-from data_tools.files.readers import parsed_json
+from data_tools.files import atomic_file, open_bytes, parsed_json
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import OnlineTracker
 from saga_fg.errors import InputError
-from saga_fg.tracking import SensorTime
-from saga_fg.tracking.journal import Event, Journal, of_scene
+from saga_fg.tracking import Event, Journal, SensorTime, of_scene
 
 
 def clock_text(name: str, clock: Mapping[str, Any], since: float | None = None) -> str:

@@ -9,8 +9,6 @@ Of this process, the threads of its linear algebra and its memory: for matrices 
 more than they bring.
 """
 
-from __future__ import annotations
-
 import ctypes
 import resource
 import sys
@@ -25,9 +23,9 @@ from threadpoolctl import threadpool_limits
 
 from data_tools.datasets.detection_files import prediction_writer, predictions_path
 from saga_fg import Dataset, GreedyTracker, InputError, PredictedTracks, Scene, Tracker, Tracks
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 from saga_fg.tracking import SensorTime, Stage, TrackerView
-from saga_fg.types.track import LONGEST_PREDICTION
+from saga_fg.types import LONGEST_PREDICTION
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc
 LARGE = 2**18  # bytes

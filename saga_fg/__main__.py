@@ -4,8 +4,6 @@ It takes its packages from the folder that holds this one, even where the workin
 folders of their names. They are found by name at run time: the library itself imports none of those above it.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from importlib import import_module

@@ -1,7 +1,5 @@
 """The exceptions of saga-fg. Everything a caller can cause by what he passes in is a `SagaError`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches

@@ -8,8 +8,6 @@ The comment is what `saga-fg config` prints and what the configuration reference
 what construction checks: a number outside, or a word that is no choice of a `Literal`, ends in an `InputError`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace

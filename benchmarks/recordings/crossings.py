@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 
 from benchmarks.recordings.traffic import PERIOD, RecordedTraffic, Recordings, on_grid
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 
 Rule = Literal["priority", "all-way"]
 RULES: tuple[Rule, ...] = ("priority", "all-way")

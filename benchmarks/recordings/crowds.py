@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.recordings.eth_ucy import EthUcy
 from benchmarks.recordings.traffic import PERIOD, RecordedTraffic, Recordings, on_grid
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics import FloatArray, IntArray, StrArray
 
 RATE = 2.5  # frames a second, as the recorded ones are annotated
 DURATION, STEP = 40.0, 0.02  # s; of the integration

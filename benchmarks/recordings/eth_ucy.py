@@ -25,12 +25,10 @@ import numpy as np
 from data_tools.datasets.annotated import AnnotatedSource
 from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.source import option
-from data_tools.files.file_access import local_tree
-from data_tools.files.readers import read_table
+from data_tools.files import local_tree, read_table
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics.arrays import IntArray
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations, Dataset, Scene
+from saga_fg.numerics import IntArray
+from saga_fg.types import Annotations, Boxes, Dataset, Scene
 
 FRAME_RATES = {"eth": 15.0, "hotel": 25.0}  # of the videos, 1/s
 _COLUMNS = ("frame", "person", "x", "z", "y", "vx", "vz", "vy")

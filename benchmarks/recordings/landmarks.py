@@ -27,11 +27,10 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.files.readers import TextTable, read_lines, read_table
+from data_tools.files import TextTable, read_lines, read_table
 from data_tools.trajectories import Trajectory
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import transforms, yaw_transform
+from saga_fg.numerics import FloatArray, IntArray, transforms, yaw_transform
 
 DISTANCE_NOISE, MIN_NOISE = 0.05, 0.005  # of a step of Plaza: share of its length; at least, and sideways, m
 TURN_NOISE = 0.01  # of its heading change, rad

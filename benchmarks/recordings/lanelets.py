@@ -24,9 +24,8 @@ from typing import Any
 import numpy as np
 
 from saga_fg.errors import InputError, error_context
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
-from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.types.road_map import Lane, Point, RoadMap, StopLine, TrafficLight
+from saga_fg.numerics import FloatArray, IntArray, StrArray, wrap_angle
+from saga_fg.types import Lane, Point, RoadMap, StopLine, TrafficLight
 
 BEYOND = 12.0  # m from a stop line to its light
 REACH = 30.0  # m beyond a stop line at which a movement shows its direction

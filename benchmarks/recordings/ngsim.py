@@ -26,10 +26,9 @@ import numpy as np
 
 from benchmarks.recordings.lanelets import road_of
 from benchmarks.recordings.traffic import RecordedTraffic, Recordings, on_grid
-from data_tools.files.file_access import read_bytes
-from data_tools.files.readers import TextTable
+from data_tools.files import TextTable, read_bytes
 from saga_fg.errors import InputError
-from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE, MAX_SPEED
+from saga_fg.types import MAX_POSITION, MAX_SIZE, MAX_SPEED
 
 Road = Literal["signals", "map", "none"]
 WINDOWS, MAPS = ("windows.csv.gz", "windows.csv"), ("maps.json.gz", "maps.json")

@@ -23,10 +23,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.recordings.traffic import PERIOD, RecordedTraffic, Recordings, on_grid
-from data_tools.files.readers import NUMBERS, WHOLE, arrow_arrays
+from data_tools.files import NUMBERS, WHOLE, arrow_arrays
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
+from saga_fg.numerics import BoolArray, FloatArray, IntArray
+from saga_fg.types import MAX_POSITION, MAX_SPEED
 
 FILE = "platoons.parquet"
 JUMP = 5.0  # m/s, between a step and the speed

@@ -25,8 +25,7 @@ from pipelines.slam.results import planar_trajectory
 from saga_fg.errors import InputError
 from saga_fg.estimators import BatchSolver
 from saga_fg.graph import EGO_ERROR, LANDMARK, Additions, GraphView, NewVariable, SceneFactorGraph, ask_all, key_of
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import inverse_transform, transform_points
+from saga_fg.numerics import FloatArray, inverse_transform, transform_points
 from saga_fg.slam.mapping import MeasuredMotion, landmark_key, pose_key
 
 _SOLVER = SolverSettings(tolerance=1e-2, max_iterations=50)

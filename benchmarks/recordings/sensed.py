@@ -25,11 +25,8 @@ from data_tools.simulator.sensed_world import HEIGHT, SensedWorld
 from data_tools.simulator.settings import SensorSettings, SimulatorSettings, lidar
 from data_tools.simulator.world import scene_from_world
 from saga_fg.errors import InputError, unknown_name
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.types.boxes import MAX_POSITION, Boxes
-from saga_fg.types.dataset import Annotations, Scene
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.numerics import FloatArray, yaw_transform
+from saga_fg.types import MAX_POSITION, Annotations, Boxes, Detections, Frame, Scene
 
 MAST, ABOVE, VEHICLE = "mast", "above", "vehicle"
 MAST_HEIGHT, ABOVE_HEIGHT = 6.0, 100.0  # m

@@ -14,10 +14,10 @@ from benchmarks.recordings.openacc import FILE, openacc_platoons
 from benchmarks.recordings.sensed import MAST, VEHICLE, sensed_scene, true_scene
 from benchmarks.recordings.traffic import RecordedTraffic, Recordings
 from data_tools.datasets.source import ChosenScenes, DatasetSource, option
-from data_tools.files.file_access import local_tree
+from data_tools.files import local_tree
 from data_tools.simulator import SimulatorSettings
 from saga_fg.errors import InputError, unknown_name
-from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types import Dataset, Scene
 
 _VIEWPOINT = "Place of the sensors: mast (6 m above the middle), above, vehicle, the id of one, or X,Y,Z in m."
 

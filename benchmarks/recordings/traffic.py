@@ -16,8 +16,8 @@ import numpy as np
 
 from data_tools.simulator.road_users import SimulatedTrajectories
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.types.road_map import RoadMap
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.types import RoadMap
 
 PERIOD = 0.1  # s between moments
 MAX_STATES = 20_000_000  # moments times vehicles of one recording

@@ -22,10 +22,9 @@ import numpy as np
 from benchmarks.runner import Rows, each
 from pipelines.config import load_config
 from saga_fg.errors import SagaError
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 from saga_fg.tracking import Tracker
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.types import Boxes, Detections, Frame
 
 Kind = Literal["steady", "glitch", "drift", "jumps"]
 

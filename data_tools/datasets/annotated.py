@@ -1,7 +1,5 @@
 """Recordings that have ground truth and no detections: these come from a table, or from the annotations."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -11,11 +9,10 @@ import numpy as np
 
 from data_tools.datasets.detection_files import read_detections
 from data_tools.datasets.source import ChosenScenes, DatasetSource, option
-from data_tools.files.file_access import local_copy
+from data_tools.files import local_copy
 from saga_fg.errors import InputError
-from saga_fg.tables.detections import DetectionTable
-from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.tables import DetectionTable
+from saga_fg.types import Dataset, Detections, Frame, Scene
 
 SENSOR = "annotations"
 

@@ -6,11 +6,9 @@ over the annotations k of one object in order of time; at the ends of its annota
 r = 1 and 1.5 s as the longest gap this is `NuScenes.box_velocity` of the nuScenes development kit.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
+from saga_fg.numerics import FloatArray, IntArray, StrArray
 
 
 def central_differences(

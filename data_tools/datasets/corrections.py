@@ -14,14 +14,12 @@ y alone are required; its time is that of the place unless it has one. Every lin
 `saga_fg.smoothing.corrections` says what they do.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from data_tools.datasets.detection_files import write_rows
-from data_tools.files.readers import parsed_json, read_lines
+from data_tools.files import parsed_json, read_lines
 from saga_fg.errors import InputError, unknown_name
 from saga_fg.smoothing.corrections import Correction, correction_from
 

@@ -1,7 +1,5 @@
 """Tables of tracks and true objects of programs, of pandas, Polars or Arrow: judged beside each other."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from importlib.util import find_spec
@@ -12,10 +10,8 @@ from data_tools.datasets.detection_files import TrackRows, TruthTable, track_row
 from data_tools.datasets.detection_files.tracks import OWN, REQUIRED, TRUTH_COLUMNS
 from data_tools.datasets.results import Results, SceneResult, clear_figures, table_results
 from data_tools.evaluation import Evaluation, Metric
-from saga_fg.tables.column_names import TableImport
-from saga_fg.tables.columns import SETTLED, TRACK_COLUMNS
-from saga_fg.tables.detections import NAME, DetectionTable, Table, raw_table, tell
-from saga_fg.types.dataset import Dataset
+from saga_fg.tables import NAME, SETTLED, TRACK_COLUMNS, DetectionTable, Table, TableImport, raw_table, tell
+from saga_fg.types import Dataset
 
 _DEPTH = 6  # callers between a warning and the program
 

@@ -25,15 +25,15 @@ from data_tools.datasets.source import (
     names,
     option,
 )
-from data_tools.files.file_access import expanded, local_copy, name_of
+from data_tools.files import expanded, local_copy, name_of
 from saga_fg.errors import InputError
-from saga_fg.tables.column_names import pairs
-from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.tables import pairs
+from saga_fg.types import Dataset, Scene
 
 if TYPE_CHECKING:
     from data_tools.evaluation import Evaluation
-    from saga_fg.numerics.arrays import FloatArray
-    from saga_fg.types.dataset import Mend
+    from saga_fg.numerics import FloatArray
+    from saga_fg.types import Mend
 
 JUDGED: tuple[Verb, ...] = ("evaluate", "evaluate labels", "report", "view")
 """Verbs that compare with true objects."""

@@ -16,8 +16,6 @@ Moments that did not come back are left as they are. Boxes that are gone where n
 can't be said by corrections: they are named.
 """
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -29,9 +27,8 @@ import numpy as np
 from data_tools.datasets.results import SceneResult
 from data_tools.metrics import SceneBoxes
 from data_tools.metrics.scene_boxes import near_pairs
-from saga_fg.numerics.arrays import BoolArray, IntArray
-from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.types.boxes import Boxes
+from saga_fg.numerics import BoolArray, IntArray, wrap_angle
+from saga_fg.types import Boxes
 
 SAME = 0.02  # m and rad; Datumaro writes two decimals
 REACH = 2.0  # between the centres of a box before and after, m

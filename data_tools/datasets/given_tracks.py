@@ -4,8 +4,6 @@ A track's velocity is no measurement, it follows from the boxes; so it is left o
 predictions, where the table says so (`coasting`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -16,8 +14,7 @@ import numpy as np
 from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import DatasetSource, HeldScene, OpenedPart, Part, Parts, scene_digests
 from saga_fg.errors import InputError
-from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.types import Dataset, Detections, Frame, Scene
 
 SENSOR = "tracks"
 """Name of the first result as a sensor; the others are tracks_2, tracks_3, ..."""

@@ -16,8 +16,6 @@ rx, ry, rz, and sx, sy, sz); https://docs.cvat.ai/docs/dataset_management/format
 `keyframe` make tracks of boxes); https://github.com/naurril/SUSTechPOINTS, doc/data-format.md (Euler angles XYZ).
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -27,21 +25,18 @@ from typing import Any, TypeVar
 import numpy as np
 
 from data_tools.datasets.results import SceneResult
-from data_tools.files.file_access import read_text
-from data_tools.files.isolated_reading import isolated
-from data_tools.files.readers import parsed_json
+from data_tools.files import isolated, parsed_json, read_text
 from data_tools.metrics import SceneBoxes
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics.arrays import IntArray
-from saga_fg.numerics.geometry import (
+from saga_fg.numerics import (
+    IntArray,
     checked_quaternions,
     inverse_transform,
     quaternion_yaw,
     rotation_quaternion,
     yaw_quaternion,
 )
-from saga_fg.types.boxes import MAX_POSITION, Boxes
-from saga_fg.types.dataset import Scene
+from saga_fg.types import MAX_POSITION, Boxes, Scene
 
 ToolBox = tuple[str, str, list[float]]
 """Object, class, and x, y, z, length, width, height, m, heading, rad."""

@@ -35,15 +35,13 @@ from data_tools.datasets.source import (
     TrackedScenes,
     option,
 )
-from data_tools.files.file_access import atomic_directory, read_text, write_text
+from data_tools.files import atomic_directory, read_text, write_text
 from data_tools.metrics import SceneBoxes
 from data_tools.metrics.hota import SceneSimilarities, image_overlaps, similarity_metrics
 from saga_fg.errors import InputError, error_context
-from saga_fg.model.sensor import GroundCamera
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.types.dataset import Annotations, Dataset, Scene
-from saga_fg.types.frame import Frame
-from saga_fg.types.track import Tracks
+from saga_fg.model import GroundCamera
+from saga_fg.numerics import FloatArray, IntArray
+from saga_fg.types import Annotations, Dataset, Frame, Scene, Tracks
 
 if TYPE_CHECKING:
     from data_tools.evaluation import Evaluation

@@ -13,10 +13,9 @@ import numpy as np
 from data_tools.datasets.detection_files import TableImport, TrackRows
 from data_tools.metrics import SceneBoxes
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.tables.plausibility import usual_class
-from saga_fg.types.dataset import Dataset, Mend, Scene
-from saga_fg.types.track import known_velocities
+from saga_fg.numerics import FloatArray, IntArray
+from saga_fg.tables import usual_class
+from saga_fg.types import Dataset, Mend, Scene, known_velocities
 
 if TYPE_CHECKING:
     from data_tools.evaluation import Evaluation, Metric

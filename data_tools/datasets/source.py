@@ -38,18 +38,17 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
 import numpy as np
 
-from data_tools.files.file_access import open_bytes
+from data_tools.files import open_bytes
 from saga_fg.errors import InputError, unknown_name
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 from saga_fg.parts import find, names_of, part_kind
-from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types import Dataset, Scene
 
 if TYPE_CHECKING:
     from data_tools.datasets.results import Results
-    from data_tools.lidar.scan import ScanSequence
+    from data_tools.lidar import ScanSequence
     from saga_fg.smoothing import Labels
-    from saga_fg.types.dataset import Mend
-    from saga_fg.types.track import Tracks
+    from saga_fg.types import Mend, Tracks
 
 Verb = Literal[
     "track", "smooth", "evaluate", "evaluate labels", "benchmark", "report", "view", "learn noise", "learn interactions"

@@ -14,8 +14,6 @@ POSIX and Windows) only when everything went well; any exception, KeyboardInterr
 and leaves an earlier file of that name as it was.
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import os

@@ -8,8 +8,6 @@ The child has the rights of its parent: this protects from files that make a rea
 from a reader that runs code of a file.
 """
 
-from __future__ import annotations
-
 import atexit
 import os
 import resource

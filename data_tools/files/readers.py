@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from data_tools.files.file_access import open_bytes, open_text, read_text
 from data_tools.files.isolated_reading import isolated
 from saga_fg.errors import InputError, MissingExtraError, error_context
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 
 LONGEST = 100  # characters of a value
 LARGEST = 1e15  # largest number; its square does not overflow

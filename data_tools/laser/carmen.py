@@ -25,10 +25,9 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.files.file_access import read_text
-from data_tools.files.isolated_reading import isolated
+from data_tools.files import isolated, read_text
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 
 _RECORDS = ("FLASER", "ROBOTLASER1")
 _UNPACK: dict[str, Callable[..., Any]] = {".bz2": bz2.open, ".gz": gzip.open}

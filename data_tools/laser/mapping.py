@@ -36,7 +36,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics import BoolArray, FloatArray, IntArray
 
 SIGMA = 0.04  # m, of a point about its line: noise of the laser, and what is not a line
 SMEAR = 4.0  # how often the points of a wall say the same: information of a registration is divided by this

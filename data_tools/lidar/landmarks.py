@@ -28,8 +28,6 @@ Its position is the mean of its points, moved away from the sensor, because the 
 lie on average pi/4 r in front of its centre. The width w across the line of sight gives r = w / 2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -40,7 +38,7 @@ from scipy.spatial import cKDTree
 
 from data_tools.lidar.registration import surfels_of
 from data_tools.lidar.scan import cell_order_statistics, clusters_from_above
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics import BoolArray, FloatArray, IntArray
 
 _WEDGES = 60  # number of sectors of the polar grid
 _RING_WIDTH = 1.5  # width of a ring, m

@@ -37,8 +37,7 @@ from scipy.spatial import cKDTree
 
 from data_tools.lidar.scan import voxel_downsample
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, checked
-from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
+from saga_fg.numerics import FloatArray, checked, inverse_transform, transform_points, yaw_transform
 
 CELL, _CELLS = 1.5, 64  # m; of an image in each direction
 _PADDED = 2 * _CELLS

@@ -5,8 +5,6 @@ that runs backwards, a last scan that was cut off, and scans of two sensors in t
 far it is in each direction: a scan is more like the one before than like that before it, if one sensor took them.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -18,10 +16,9 @@ import numpy as np
 
 from data_tools.lidar.scan import Scan, ScanSequence, cell_order_statistics
 from saga_fg.errors import InputError, error_context
-from saga_fg.numerics.arrays import FloatArray, checked
-from saga_fg.numerics.geometry import checked_transform
+from saga_fg.numerics import FloatArray, checked, checked_transform
 from saga_fg.slam.sensors import SensorName
-from saga_fg.types.frame import Frame
+from saga_fg.types import Frame
 
 PERIOD = 0.1  # s between scans of which no time is known
 _BEARINGS = 36  # directions in which distances are compared

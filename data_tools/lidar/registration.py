@@ -56,8 +56,7 @@ from scipy.spatial import cKDTree
 
 from data_tools.lidar.scan import voxel_groups, voxel_keys
 from saga_fg.errors import SagaError
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
-from saga_fg.numerics.geometry import transform_points
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, transform_points
 
 LEAST_POINTS = 6  # of a flat surfel
 FLAT = 1 / 9  # largest share of the smallest eigenvalue in the second: a third of the standard deviation

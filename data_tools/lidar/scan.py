@@ -27,8 +27,6 @@ carries. The package `libusb-package` carries it; once loaded with global symbol
 name.
 """
 
-from __future__ import annotations
-
 import ctypes
 import importlib
 import sys
@@ -41,9 +39,8 @@ import numpy as np
 from scipy.ndimage import label
 
 from saga_fg.errors import InputError, MissingExtraError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
-from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.types.boxes import Boxes
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, checked, yaw_transform
+from saga_fg.types import Boxes
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,8 +27,6 @@ specification 1.4 R15.
 Open3D writes clouds, and reads compressed PCD.
 """
 
-from __future__ import annotations
-
 import struct
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -40,12 +38,10 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from data_tools.files.file_access import open_bytes, read_bytes, write_bytes
-from data_tools.files.isolated_reading import isolated
-from data_tools.files.readers import load_archive, load_array
+from data_tools.files import isolated, load_archive, load_array, open_bytes, read_bytes, write_bytes
 from data_tools.lidar.scan import Scan, load_open3d
 from saga_fg.errors import InputError, MissingExtraError, error_context
-from saga_fg.numerics.arrays import BoolArray, FloatArray, checked
+from saga_fg.numerics import BoolArray, FloatArray, checked
 
 Columns = Mapping[str, NDArray[Any]]
 """Values (N,) of the points by name."""

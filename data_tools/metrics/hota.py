@@ -13,8 +13,6 @@ Sources: Luiten et al., HOTA: A Higher Order Metric for Evaluating Multi-object 
 Performance Measures and a Data Set for Multi-Target, Multi-Camera Tracking, ECCV Workshops 2016 (Identity).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -23,8 +21,8 @@ import numpy as np
 
 from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.errors import InputError, MissingExtraError
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
-from saga_fg.types.boxes import Boxes, bev_iou, iou_3d
+from saga_fg.numerics import FloatArray, IntArray, StrArray
+from saga_fg.types import Boxes, bev_iou, iou_3d
 
 Similarity = Literal["centre", "bev_iou", "iou_3d"]
 

@@ -23,8 +23,6 @@ Then such true boxes are removed. The others are compared by any similarity: "im
 is that of the benchmark. Source: preprocessing of the benchmark's evaluation, `trackeval.datasets.Kitti2DBox`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -34,8 +32,8 @@ from scipy.optimize import linear_sum_assignment
 
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
 from data_tools.metrics.hota import HotaMetrics, SceneSimilarities, box_similarities, image_overlaps, similarity_metrics
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
-from saga_fg.types.boxes import Boxes
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray
+from saga_fg.types import Boxes
 
 NEIGHBOURS = {"car": ("van",), "pedestrian": ("person_sitting",)}
 PERSON = "person"

@@ -39,8 +39,6 @@ A trajectory that never counts is left out. Mostly tracked: in over 0.8 of the f
 0.2 of them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -56,8 +54,8 @@ from data_tools.metrics.kitti_boxes import (
     true_boxes,
 )
 from data_tools.metrics.scene_boxes import Candidates, best_pairs, optimal_pairs
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.types.boxes import paired_iou_3d
+from saga_fg.numerics import BoolArray, FloatArray, IntArray
+from saga_fg.types import paired_iou_3d
 
 __all__ = [
     "KittiSimilarity",

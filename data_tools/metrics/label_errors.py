@@ -34,9 +34,17 @@ from typing import Any, Self
 import numpy as np
 
 from data_tools.metrics.scene_boxes import SceneBoxes, nearest_pairs
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray, checked
-from saga_fg.numerics.geometry import chi_square_quantile, wrap_angle
-from saga_fg.types.boxes import Boxes
+from saga_fg.numerics import (
+    BoolArray,
+    Columns,
+    FloatArray,
+    IntArray,
+    StrArray,
+    checked,
+    chi_square_quantile,
+    wrap_angle,
+)
+from saga_fg.types import Boxes
 
 
 @dataclass(frozen=True, eq=False)

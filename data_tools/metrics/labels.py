@@ -17,8 +17,6 @@ the score,
     precision = true / (true + false),   recall = true / visible objects
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -27,8 +25,7 @@ import numpy as np
 
 from data_tools.metrics.label_errors import ErrorSample, nees
 from data_tools.metrics.scene_boxes import SceneBoxes, near_pairs, nearest_pairs
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
-from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, wrap_angle
 
 __all__ = [
     "QUANTITIES",

@@ -46,8 +46,8 @@ from typing import Self
 import numpy as np
 
 from data_tools.metrics.scene_boxes import Candidates, SceneBoxes, optimal_pairs
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
-from saga_fg.types.boxes import Boxes
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray
+from saga_fg.types import Boxes
 
 RACKED = ("bicycle", "motorcycle")
 

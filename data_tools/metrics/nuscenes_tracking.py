@@ -10,8 +10,6 @@ with results equal to the official evaluation (`nuscenes.eval.tracking`, configu
 Sources: https://www.nuscenes.org/tracking; Caesar et al., nuScenes, CVPR 2020; Weng et al., AB3DMOT, IROS 2020.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 
@@ -29,9 +27,9 @@ from data_tools.metrics.nuscenes_sweep import (
 )
 from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, checked
+from saga_fg.numerics import FloatArray, checked
 from saga_fg.settings import setting, settings_group
-from saga_fg.types.boxes import Boxes
+from saga_fg.types import Boxes
 
 _MIN_RECALL = 0.1  # lowest recall of the sweep
 _RECALLS = 40  # values of recall in the sweep; this and the gate as in `tracking_nips_2019`

@@ -42,10 +42,8 @@ import numpy as np
 from data_tools.metrics.label_errors import ErrorSample, nees
 from data_tools.metrics.scene_boxes import Candidates, SceneBoxes, best_pairs
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.types.dataset import Annotations
-from saga_fg.types.track import Tracks
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, wrap_angle
+from saga_fg.types import Annotations, Tracks
 
 Found = Tracks | SceneBoxes  # of one frame: a tracker's output, or rows of a result file
 CAP = 5.0  # largest carried error, also that of a hidden object whose track is lost, m

@@ -9,8 +9,6 @@ Pairs of boxes of the same frame and class: all within a gate, and the best one-
 Pairs of a frame do not depend on other frames or on identities, so trackers are compared on the same labels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -21,10 +19,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray, checked, checked_labels
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations
-from saga_fg.types.track import Tracks
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, checked, checked_labels
+from saga_fg.types import Annotations, Boxes, Tracks
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,6 @@ of the header tells them apart. Times of topics whose clock is another than that
 difference. Sources: the definitions in https://github.com/ros2/common_interfaces; REP 103, 105 and 145.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,12 +25,11 @@ from data_tools.datasets.kitti.dataset import world_position
 from data_tools.datasets.mcap.recording import SUFFIXES, LoggedMessage, Recording, Topic, decoded_messages
 from data_tools.datasets.mcap.ros2_types import checked_time, frame_name, nanoseconds, xyz
 from data_tools.datasets.mcap.transforms import TRANSFORM_TYPES, TransformRecord, TransformTree, transform_records
-from data_tools.files.isolated_reading import isolated
+from data_tools.files import isolated
 from data_tools.laser.carmen import LaserLog, padded
-from data_tools.lidar.recording import RecordingOptions, ScanRecording
-from data_tools.lidar.scan_files import Columns, scan_columns, scan_of_columns
+from data_tools.lidar import Columns, RecordingOptions, ScanRecording, scan_columns, scan_of_columns
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.slam.sensors import SensorName
 
 CLOUD, LASER, ODOMETRY = "sensor_msgs/PointCloud2", "sensor_msgs/LaserScan", "nav_msgs/Odometry"

@@ -6,8 +6,6 @@ point of the group `saga_fg.scans` of an installed package.
 Marked *untested on originals*: written by the specification, and tested with files that were made by it.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import re
@@ -22,20 +20,26 @@ from data_tools.datasets.kitti import KittiTracking, kitti_scans
 from data_tools.datasets.kitti.dataset import read_origin, read_transform
 from data_tools.datasets.nuscenes.dataset import nuscenes_scans
 from data_tools.datasets.nuscenes.tables import read_table, table_folder
-from data_tools.files.readers import read_lines
-from data_tools.files.readers import read_table as read_rows
-from data_tools.lidar.recording import RecordingOptions, ScanRecording
-from data_tools.lidar.scan import Scan
-from data_tools.lidar.scan_files import KITTI, SUFFIXES, read_columns, read_records, scan_of_columns
+from data_tools.files import read_lines
+from data_tools.files import read_table as read_rows
+from data_tools.lidar import (
+    KITTI,
+    SUFFIXES,
+    RecordingOptions,
+    Scan,
+    ScanRecording,
+    read_columns,
+    read_records,
+    scan_of_columns,
+)
 from data_tools.recordings.bags import is_bag, open_bag
 from data_tools.sensor_logs import kitti_sensor_log
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import inverse_transform, quaternion_rotation
+from saga_fg.numerics import FloatArray, inverse_transform, quaternion_rotation
 from saga_fg.parts import find
 from saga_fg.providers.odometry import mounting
-from saga_fg.tables.column_names import seconds_of_dates
+from saga_fg.tables import seconds_of_dates
 
 GROUP = "saga_fg.scans"
 """Group of entry points of packages that bring layouts."""

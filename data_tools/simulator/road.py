@@ -40,7 +40,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from data_tools.simulator.settings import VAN_SHARE, TrafficSettings
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray
 
 GRID = 0.5  # m
 

@@ -27,8 +27,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from data_tools.simulator.road import Road
-from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
-from saga_fg.types.boxes import Boxes
+from saga_fg.numerics import BoolArray, FloatArray, StrArray
+from saga_fg.types import Boxes
 
 AT_SAMPLE = 1e-6  # share of a step within which a time is that of a sample
 

@@ -1,7 +1,5 @@
 """The layout of a simulated scene, sampled from its settings, with disturbances and surroundings."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,8 +19,8 @@ from data_tools.simulator.road import (
     sample_sizes,
 )
 from data_tools.simulator.settings import SimulatorSettings, TrafficSettings
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.types.boxes import Boxes
+from saga_fg.numerics import BoolArray, FloatArray, IntArray
+from saga_fg.types import Boxes
 
 
 @dataclass(frozen=True, eq=False)

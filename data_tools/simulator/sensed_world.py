@@ -18,8 +18,6 @@ An object within the annotation range is annotated while a sensor sees enough of
 counts as visible only in views of some duration; a shorter view does not reveal its motion.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -30,14 +28,9 @@ from data_tools.simulator.road import KINDS, Lanes
 from data_tools.simulator.road_users import BODY, SimulatedTrajectories
 from data_tools.simulator.scene_layout import ClosingLine
 from data_tools.simulator.settings import CLEAR_SHARE, HIDDEN_SHARE, SensorSettings, SimulatorSettings
-from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
-from saga_fg.numerics.geometry import transform_points, wrap_angle, yaw_of
-from saga_fg.tracking.visibility import visible_share
-from saga_fg.types import road_map
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations
-from saga_fg.types.frame import Detections
-from saga_fg.types.road_map import COLOURS, RoadMap
+from saga_fg.numerics import BoolArray, FloatArray, StrArray, transform_points, wrap_angle, yaw_of
+from saga_fg.tracking import visible_share
+from saga_fg.types import COLOURS, Annotations, Boxes, Detections, RoadMap, road_map
 
 CLUTTER = (("pedestrian", BODY), *((kind.label, kind.size) for kind in KINDS))
 CLUTTER_SHARES = (0.4, 0.4, 0.1, 0.07, 0.03)

@@ -10,8 +10,6 @@ cycling      cyclists beside slow traffic
 two-sensors  a LiDAR with few points on far and small objects, and with outages; cameras that see far ahead
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ detections.csv   a row per detection of every sensor, world coordinates, with th
 truth.csv        a row per annotated object and keyframe; `id` is its name, `visible` is 1 while a sensor sees it
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections.abc import Collection, Iterator
@@ -22,9 +20,8 @@ from data_tools.datasets.detection_files import write_rows
 from data_tools.datasets.source import DatasetSource, HeldScene, OpenedPart, Parts, option
 from data_tools.simulator.settings import SimulatorSettings
 from data_tools.simulator.world import SimulatedTraffic
-from saga_fg.numerics.geometry import yaw_of
-from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.frame import Frame
+from saga_fg.numerics import yaw_of
+from saga_fg.types import Dataset, Frame, Scene
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,8 +15,6 @@ Both parts follow the path of the combination: along the lane, the truck's centr
 centre of the combination, the trailer's is (total - trailer) / 2 behind it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,7 +33,7 @@ from data_tools.simulator.road import (
 )
 from data_tools.simulator.road_users import SimulatedTrajectories
 from data_tools.simulator.scene_layout import SceneLayout
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics import BoolArray, FloatArray, IntArray
 
 CHANGE_INTERVAL = 0.5  # s between two decisions to change lanes
 SLOWEST_CHANGE = 2.0  # m/s, lowest speed at which a voluntary lane change starts

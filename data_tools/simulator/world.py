@@ -1,7 +1,5 @@
 """The simulated world of a scene, its frames and its ground truth."""
 
-from __future__ import annotations
-
 import zlib
 from dataclasses import dataclass
 from functools import partial
@@ -31,10 +29,8 @@ from data_tools.simulator.sensed_world import (
 from data_tools.simulator.settings import SimulatorSettings
 from data_tools.simulator.traffic import Traffic, TrafficHistory, record_traffic, split_trailers
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, StrArray
-from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.types.dataset import Scene
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.numerics import FloatArray, StrArray, yaw_transform
+from saga_fg.types import Detections, Frame, Scene
 
 SURROUNDED = (-300.0, 400.0)  # m along the road from the focus: extent of buildings, hedges, parked cars
 POPULATED = (-150.0, 100.0)  # m along the road from the focus: start positions of pedestrians and cyclists

@@ -1,7 +1,5 @@
 """The command `saga-fg`. What a command needs is imported when it runs, so that `--help` answers at once."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:

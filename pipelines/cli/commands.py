@@ -1,7 +1,5 @@
 """The command `saga-fg`: its sub-commands by name, each in a module that is imported when it is asked for."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from importlib.metadata import metadata
 from pathlib import Path

@@ -132,7 +132,7 @@ def progress_bar(scenes: int | None = None, unit: str = "frames") -> Iterator[Pr
 def writable(path: Path | None) -> Path | None:
     """Refuse a file that cannot be written before the work begins."""
     if path is not None:
-        from data_tools.files.file_access import check_writable
+        from data_tools.files import check_writable
 
         check_writable(path)
     return path
@@ -151,7 +151,7 @@ MarkdownFile = Annotated[
 def report(tables: Iterable[FigureTable], figures: Any, json_file: Path | None, markdown: Path | None = None) -> None:
     """Print the tables, and write the figures and the tables to the files that were asked for."""
     from data_tools.figures import write_figures
-    from data_tools.files.file_access import write_text
+    from data_tools.files import write_text
 
     tables = list(tables)
     show_tables(tables)

@@ -1,7 +1,5 @@
 """`saga-fg evaluate` and `saga-fg benchmark`: how good are tracks and labels?"""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,7 +12,7 @@ from data_tools.datasets.detection_files import read_tracks
 from data_tools.datasets.results import Results
 from data_tools.datasets.source import DatasetSource, Innovations, input_files
 from data_tools.evaluation import LEGEND
-from data_tools.files.file_access import write_text, write_zip
+from data_tools.files import write_text, write_zip
 from pipelines.checks import CheckedDataset, Checks
 from pipelines.cli import options
 from pipelines.cli.console import JsonFile, MarkdownFile, progress_bar, report, show_summary, show_tables, working

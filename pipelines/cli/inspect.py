@@ -1,7 +1,5 @@
 """`saga-fg inspect` and `saga-fg explain`: how a table is understood, why a track is as it is."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,17 +13,16 @@ from data_tools.datasets import import_options
 from data_tools.datasets.detection_files import TableImport
 from data_tools.datasets.detection_files.dataset import TableSurvey, survey_table
 from data_tools.figures import write_figures
-from data_tools.files.file_access import check_writable
+from data_tools.files import check_writable
 from pipelines.cli.console import JsonFile, counted
 from pipelines.cli.options import Verbose
 from pipelines.config import load_config
 from pipelines.configuration import load_settings
 from pipelines.explaining import clock_lines, journal_of, read_track, story
 from saga_fg.errors import error_context
-from saga_fg.model.edge_rules import acting_classes
-from saga_fg.tables.column_names import pairs
-from saga_fg.tables.plausibility import idle_rules, usual_classes
-from saga_fg.types.dataset import FILL_IN, Finding, Mend
+from saga_fg.model import acting_classes
+from saga_fg.tables import idle_rules, pairs, usual_classes
+from saga_fg.types import FILL_IN, Finding, Mend
 
 MOST = 12  # scenes and classes that are listed
 EPOCH = 1e8  # s, from which times count from 1970

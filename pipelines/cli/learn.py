@@ -1,14 +1,12 @@
 """`saga-fg learn`: settings from recordings."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from data_tools.datasets.source import DatasetSource, dataset_names, input_files
-from data_tools.files.file_access import check_writable, write_text
+from data_tools.files import check_writable, write_text
 from pipelines.cli import options
 from pipelines.cli.console import JsonFile, MarkdownFile, ReportingGroup, counted, new_group, progress_bar, report
 from pipelines.cli.options import dataset_commands

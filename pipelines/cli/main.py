@@ -1,7 +1,5 @@
 """The entry point of the installed command, which listens to SIGTERM before anything slow is imported."""
 
-from __future__ import annotations
-
 import sys
 from importlib import import_module
 

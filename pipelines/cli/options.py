@@ -1,7 +1,5 @@
 """Options that commands share, how to track among them, and the commands of a verb for each dataset."""
 
-from __future__ import annotations
-
 import inspect
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -15,17 +13,16 @@ import typer
 
 from data_tools.datasets.detection_file_source import DetectionFileSource
 from data_tools.datasets.source import DatasetSource, Verb, dataset_names, dataset_source
-from data_tools.files.file_access import check_writable, write_text
+from data_tools.files import check_writable, write_text
 from pipelines.cli.console import ReportingGroup, new_command, new_group, set_up_logging
 from pipelines.config import Method, TrackConfig, load_config, load_interactions
 from pipelines.configuration import load_settings
 from pipelines.learning import offset_fragment
 from pipelines.report.page import as_recorded
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.tracking import AssociationName, SensorTime
-from saga_fg.tracking.by_name import estimator_parameters
-from saga_fg.types.track import checked_horizons
+from saga_fg.numerics import FloatArray
+from saga_fg.tracking import AssociationName, SensorTime, estimator_parameters
+from saga_fg.types import checked_horizons
 
 Verbose = Annotated[
     bool, typer.Option("--verbose", "-v", help="Say more on stderr.", callback=set_up_logging, show_default=False)

@@ -1,7 +1,5 @@
 """`saga-fg report` and `saga-fg view`: results to look at."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +8,7 @@ from typing import Annotated
 import typer
 
 from data_tools.datasets.source import DatasetSource, input_files
-from data_tools.files.file_access import check_writable, write_text
+from data_tools.files import check_writable, write_text
 from pipelines import view
 from pipelines.cli import options
 from pipelines.cli.console import working

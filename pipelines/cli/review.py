@@ -1,7 +1,5 @@
 """`saga-fg review`: labels corrected on a page."""
 
-from __future__ import annotations
-
 import os
 import signal
 from contextlib import chdir, suppress
@@ -11,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from data_tools.files.file_access import check_writable, write_text
+from data_tools.files import check_writable, write_text
 from pipelines.cli.console import counted, working
 from pipelines.cli.options import Verbose
 from pipelines.review import (

@@ -39,7 +39,7 @@ from pipelines.serving.settings import LogLimitFilter
 from pipelines.tracking import one_thread, return_large_blocks
 from saga_fg.errors import InputError
 from saga_fg.kernels.compilation import load_kernels
-from saga_fg.tables.column_names import pairs
+from saga_fg.tables import pairs
 
 DEFAULT_ADDRESS = "127.0.0.1:7447"
 

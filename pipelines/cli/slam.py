@@ -1,7 +1,5 @@
 """`saga-fg slam`: trajectories and maps, from recordings and graph files."""
 
-from __future__ import annotations
-
 import math
 import time
 from pathlib import Path
@@ -10,7 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 import typer
 
-from data_tools.files.file_access import check_writable_folder
+from data_tools.files import check_writable_folder
 from data_tools.laser import read_carmen
 from data_tools.pose_graphs import read_g2o
 from data_tools.recordings import RecordingOptions, is_bag, read_bag_laser
@@ -23,7 +21,7 @@ from pipelines.slam.laser_slam import laser_slam
 from pipelines.slam.results import write_laser_slam, write_pose_graph
 from saga_fg import InputError
 from saga_fg.errors import error_context
-from saga_fg.numerics.arrays import IntArray
+from saga_fg.numerics import IntArray
 from saga_fg.slam.pose_graph import consensus, graph_error, optimise_poses
 
 Loss = Literal["consensus", "huber", "cauchy", "geman-mcclure", "tukey"]

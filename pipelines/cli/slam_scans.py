@@ -1,7 +1,5 @@
 """`saga-fg slam scans`: trajectory, map and landmarks from recorded LiDAR scans."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,9 +8,8 @@ from typing import Annotated, Literal
 import numpy as np
 import typer
 
-from data_tools.files.file_access import check_writable_folder
-from data_tools.lidar.recording import PERIOD
-from data_tools.lidar.scan import ScanSequence
+from data_tools.files import check_writable_folder
+from data_tools.lidar import PERIOD, ScanSequence
 from data_tools.recordings import LAYOUTS, RecordingOptions, ScanRecording, open_recording
 from data_tools.sensor_logs import SensorLog
 from pipelines.cli.console import counted, progress_bar, working
@@ -23,7 +20,7 @@ from pipelines.slam.localisation import LocaliserSettings, localise
 from pipelines.slam.results import write_lidar_slam, write_localised
 from pipelines.slam.submaps import Origin, SlamMap, read_map
 from saga_fg.errors import InputError
-from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.numerics import yaw_transform
 from saga_fg.providers.odometry import mounting
 
 

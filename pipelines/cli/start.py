@@ -1,7 +1,5 @@
 """`saga-fg config`, `saga-fg demo` and `saga-fg simulate`: settings and recordings to begin with."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args

@@ -1,7 +1,5 @@
 """`saga-fg track` and `saga-fg smooth`: detections in, tracks or labels out, in parallel if wanted."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

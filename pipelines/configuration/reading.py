@@ -37,7 +37,7 @@ from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get
 
 import yaml
 
-from data_tools.files.file_access import read_text
+from data_tools.files import read_text
 from saga_fg.errors import InputError
 from saga_fg.parts import PartKind, as_part, find, kind_among, names_of
 from saga_fg.settings import Range, range_of

@@ -6,8 +6,6 @@ settings do not are written as `null`, which takes them away when the text is re
 A selection names settings by dotted keys, `*` for every entry of a table: `tracker.classes.*.max_deviation`.
 """
 
-from __future__ import annotations
-
 import re
 import textwrap
 from collections.abc import Mapping, Sequence

@@ -18,10 +18,8 @@ from data_tools.metrics.scene import match_scene
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, track_scene
 from saga_fg.learning.labelled_scene import LONGEST, Gap, LabelledScene, made_gaps, reached
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.types.dataset import Scene
-from saga_fg.types.frame import Frame
-from saga_fg.types.track import Tracks
+from saga_fg.numerics import FloatArray
+from saga_fg.types import Frame, Scene, Tracks
 
 SETTLING = 0.6  # s: for so long a returning object may wait for its identity
 DETECTED = 0.15  # s: a track counts as detected for so long, as sensors don't measure at the moments of labels

@@ -18,8 +18,6 @@ errors decide alone.
 Each group of classes between which there are edges has its own form.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -37,13 +35,8 @@ from saga_fg.errors import InputError
 from saga_fg.learning import MAX_GAPS, TEMPLATE, HiddenObjects, Rule, fit_interactions, hidden_objects
 from saga_fg.learning.hidden_objects import FOLLOWED, LONGEST
 from saga_fg.learning.labelled_scene import LENGTHS
-from saga_fg.model.edge_rules import Following, Neighbours
-from saga_fg.model.nonlinear_interactions import AccelerationLaw
-from saga_fg.model.sensor import Sensor
-from saga_fg.model.stability import LearnedInteractions
-from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.dataset import Annotations, Scene
-from saga_fg.types.track import Tracks
+from saga_fg.model import AccelerationLaw, Following, LearnedInteractions, Neighbours, Sensor
+from saga_fg.types import DEFAULT, Annotations, Scene, Tracks
 
 BASE, SHIPPED, LEARNED = "base motion", "shipped edges", "learned edges"
 NOWHERE = "nowhere"

@@ -9,8 +9,6 @@ that differ:
     o = sum_k o_k / s_k^2 / sum_k 1 / s_k^2,   s^2 = max(1, chi^2 / (n - 1)) / sum_k 1 / s_k^2
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -38,11 +36,9 @@ from saga_fg.learning import (
     sample_with_tracker,
     sample_with_truth,
 )
-from saga_fg.model.motion import ConstantVelocity, Curvilinear, Motion
-from saga_fg.model.sensor import NoiseModel, Sensor, sensor_model
+from saga_fg.model import ConstantVelocity, Curvilinear, Motion, NoiseModel, Sensor, sensor_model
 from saga_fg.tracking import ClassSettings, SensorTime, Tracker
-from saga_fg.types.by_class import DEFAULT, class_settings
-from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types import DEFAULT, Dataset, Scene, class_settings
 
 log = logging.getLogger(__name__)
 

@@ -1,7 +1,5 @@
 """Tables of tracks of programs, of pandas, Polars or Arrow, as a page with a player, in a notebook or a file."""
 
-from __future__ import annotations
-
 import html
 from dataclasses import dataclass
 from functools import partial
@@ -9,13 +7,12 @@ from pathlib import Path
 
 from data_tools.datasets.data_frames import found_results
 from data_tools.datasets.results import Results, clear_figures
-from data_tools.files.file_access import write_text
+from data_tools.files import write_text
 from pipelines.config import load_config
 from pipelines.report.page import Report, report_page, result_figures
 from pipelines.report.scenes import ReportScene
 from saga_fg.errors import InputError
-from saga_fg.tables.column_names import TableImport
-from saga_fg.tables.detections import Table
+from saga_fg.tables import Table, TableImport
 
 _HEIGHT = 720  # of the frame in a notebook, pixels
 

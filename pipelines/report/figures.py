@@ -1,7 +1,5 @@
 """Figures of a report: the time of the tracker, and tracks without ground truth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -11,8 +9,8 @@ import numpy as np
 from data_tools.datasets.results import SceneResult
 from data_tools.figures import Chart, FigureTable, Series, cell, distribution
 from data_tools.metrics import SceneBoxes
-from saga_fg.numerics.arrays import Columns, FloatArray, StrArray
-from saga_fg.types.boxes import Boxes
+from saga_fg.numerics import Columns, FloatArray, StrArray
+from saga_fg.types import Boxes
 
 
 def latency_chart(milliseconds: FloatArray) -> Chart:

@@ -8,8 +8,6 @@ The record of a run, written beside its result for reports: method, version, con
  "recordings": how they were read, "clocks": {scene: {sensor: its clock}} where there are several}
 """
 
-from __future__ import annotations
-
 import base64
 import html
 import json
@@ -27,8 +25,7 @@ from data_tools.datasets.detection_files import read_predictions
 from data_tools.datasets.results import Results
 from data_tools.datasets.source import DatasetSource
 from data_tools.figures import COLOURS, Chart, FigureTable, as_json, class_colours
-from data_tools.files.file_access import read_bytes, write_text
-from data_tools.files.readers import parsed_json
+from data_tools.files import parsed_json, read_bytes, write_text
 from pipelines.config import load_config
 from pipelines.explaining import clock_table
 from pipelines.report.figures import UNSEEN, latency_chart, track_charts, track_figures

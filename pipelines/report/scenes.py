@@ -26,8 +26,6 @@ Lengths in cm about the scene's start; lights are counted from 0. A colour is 0 
 report is of the light nearest to it, or of none if that is further than `SignalSettings.max_distance` is by default.
 """
 
-from __future__ import annotations
-
 import base64
 import io
 from collections import Counter
@@ -42,17 +40,14 @@ import numpy as np
 from data_tools.datasets.detection_files import PredictionRows
 from data_tools.datasets.source import AreaMap, Images
 from data_tools.evaluation import best_thresholds, score_sweep
-from data_tools.files.isolated_reading import isolated
+from data_tools.files import isolated
 from data_tools.metrics import SceneBoxes
 from pipelines.report.figures import unseen_for
 from pipelines.tracking import TrackedScene
 from saga_fg import Boxes, ConstantVelocity, Frame, NodeType, Scene, Sensor
-from saga_fg.model.edge_rules import EdgeRule
-from saga_fg.model.interactions import NodeTable
-from saga_fg.model.sensor import sensor_model
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
-from saga_fg.numerics.geometry import yaw_of
-from saga_fg.types.road_map import COLOUR_LABELS, MAX_LIGHT_DISTANCE, Lane, StopLine, TrafficLight
+from saga_fg.model import EdgeRule, NodeTable, sensor_model
+from saga_fg.numerics import FloatArray, IntArray, StrArray, yaw_of
+from saga_fg.types import COLOUR_LABELS, MAX_LIGHT_DISTANCE, Lane, StopLine, TrafficLight
 
 Thumbnails = Mapping[str, list[str | None]]
 QUALITY = 60  # of JPEG, in percent

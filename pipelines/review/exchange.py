@@ -1,7 +1,5 @@
 """Labels out to a labelling tool, and the edits that were made there back as corrections."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from datetime import UTC, datetime
@@ -11,15 +9,12 @@ import numpy as np
 
 from data_tools.datasets.edits import Edits
 from data_tools.datasets.labelling_tools import exchanged, read_from_tool, tool_format, write_for_tool
-from data_tools.files.file_access import atomic_directory, read_text, write_text
-from data_tools.files.readers import parsed_json
-from data_tools.lidar import write_cloud
-from data_tools.lidar.scan import ScanSequence
+from data_tools.files import atomic_directory, parsed_json, read_text, write_text
+from data_tools.lidar import ScanSequence, write_cloud
 from pipelines.review.record import LabelRun, labelled_scenes
 from pipelines.scale_out import file_name
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import transform_points
+from saga_fg.numerics import FloatArray, transform_points
 
 SCAN_TIME = 0.06  # s between a moment and its scan
 WHEN = ("who", "when")  # of a correction, which do not make it another

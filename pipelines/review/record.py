@@ -3,8 +3,6 @@
 The configuration of its `RunRecord` is YAML of a `LabelRun`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -20,7 +18,7 @@ from pipelines.configuration import read_settings, write_settings
 from pipelines.report import RunRecord, read_run_record
 from pipelines.smoothing import SmoothConfig
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.types.dataset import Dataset, Scene
+from saga_fg.types import Dataset, Scene
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,6 @@ the host (DNS rebinding), 404, 405 neither GET nor POST, 409 the corrections wer
 an action that can't be done.
 """
 
-from __future__ import annotations
-
 import hmac
 import json
 import logging
@@ -24,10 +22,10 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from data_tools.files.readers import parsed_json
+from data_tools.files import parsed_json
 from pipelines.review.session import ReviewSession
 from saga_fg.errors import InputError, SagaError
-from saga_fg.types.boxes import MAX_POSITION
+from saga_fg.types import MAX_POSITION
 
 LARGEST = 65536  # bytes of a request's body
 HEADERS = {

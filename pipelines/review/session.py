@@ -7,8 +7,6 @@ the version of the file that its page has seen: one that another page has change
              or ""}] of the scene, "rows": [row of review.csv] of the scene, "scene": parts of the page's data}
 """
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json
@@ -23,8 +21,7 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.corrections import check_classes, corrections_of_lines
-from data_tools.files.file_access import check_writable, open_text, read_text, write_text
-from data_tools.files.readers import parsed_json
+from data_tools.files import check_writable, open_text, parsed_json, read_text, write_text
 from data_tools.metrics import SceneBoxes
 from pipelines.report import Report, ReportScene, report_page
 from pipelines.report.page import with_surroundings
@@ -34,11 +31,10 @@ from pipelines.review.record import LabelRun, labelled_scenes
 from pipelines.smoothing import label_model
 from pipelines.tracking import one_thread, scene_with_frames
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics.geometry import transform_points
+from saga_fg.numerics import transform_points
 from saga_fg.smoothing import LabelBuilder, Review
 from saga_fg.smoothing.corrections import Correction, correction_from, corrections_in
-from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.dataset import Scene
+from saga_fg.types import DEFAULT, Scene
 
 CORRECTIONS = "corrections.jsonl"  # in the folder of labels
 CHANGED = ("labels", "methods", "detections")  # parts of a scene's data that follow from its classes and labels

@@ -18,8 +18,6 @@ A scene is skipped if the manifest has it as done with the same inputs, configur
 unchanged. One run at a time may write to a folder.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import hashlib
@@ -40,8 +38,7 @@ from data_tools.datasets.corrections import write_outcomes
 from data_tools.datasets.detection_files import write_label_table, write_review
 from data_tools.datasets.given_tracks import TrackedRecordings
 from data_tools.datasets.source import DatasetSource, Part, part_suffix
-from data_tools.files.file_access import remove_leftovers, write_bytes
-from data_tools.files.readers import parsed_json
+from data_tools.files import parsed_json, remove_leftovers, write_bytes
 from pipelines.config import Method, TrackConfig
 from pipelines.configuration import write_settings
 from pipelines.scale_out.pools import Job, Outcome, SceneTask
@@ -49,7 +46,7 @@ from pipelines.smoothing import SmoothConfig, smooth_dataset
 from pipelines.tracking import TrackedScene, keep_predictions, track_dataset
 from saga_fg import Dataset
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 from saga_fg.smoothing import LabelCounts
 from saga_fg.smoothing.corrections import Correction
 

@@ -1,7 +1,5 @@
 """A small client of the service, for Python programs and for `saga-fg status`."""
 
-from __future__ import annotations
-
 import json
 import socket
 import time

@@ -9,8 +9,6 @@ are received too. The domain is that of the environment's ROS_DOMAIN_ID, network
 Sources: https://design.ros2.org/articles/topic_and_service_names.html; the manual of Eclipse Cyclone DDS.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import re

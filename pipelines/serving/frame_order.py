@@ -7,8 +7,6 @@ the client left some out. Frames that are held back for reordering may go in aft
 below the last one that are still held are *open*: neither taken in nor to be forgotten.
 """
 
-from __future__ import annotations
-
 import heapq
 import math
 from collections import Counter

@@ -15,8 +15,6 @@ out  tracks     the answer to a frame
      error      a message that could not be used, and why; nothing else happened
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -29,10 +27,8 @@ import numpy as np
 
 from pipelines.serving.settings import StreamSettings
 from saga_fg import Boxes, Detections, Frame, InputError, PredictedTracks, Tracks
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.types.frame import Coordinates
-from saga_fg.types.track import checked_horizons
+from saga_fg.numerics import FloatArray, yaw_transform
+from saga_fg.types import Coordinates, checked_horizons
 
 MAX_HORIZON = 10.0  # furthest time of a prediction, s
 MAX_HORIZONS = 20  # largest number of times of a prediction

@@ -8,8 +8,6 @@ then the pose counts that is known within `HOLD`. A message that cannot be used 
 log, one a minute for each topic and kind of fault.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import time
@@ -27,14 +25,13 @@ from data_tools.datasets.mcap.objects import OBJECT_TYPES, RESULTS, MessageObjec
 from data_tools.datasets.mcap.recording import LoggedMessage
 from data_tools.datasets.mcap.ros2_types import definition, encoded
 from data_tools.datasets.mcap.transforms import HOLD, ODOMETRY_TYPES, WORLD, TransformBuffer, find_places
-from data_tools.files.isolated_reading import one_line
+from data_tools.files import one_line
 from pipelines.serving.dds import Ros2Network, payload_decoder
 from pipelines.serving.messages import FrameMessage
 from pipelines.serving.server import StopRequest
 from pipelines.serving.stream import StreamTracker
 from saga_fg.errors import InputError, error_context
-from saga_fg.types.frame import Frame
-from saga_fg.types.track import Tracks
+from saga_fg.types import Frame, Tracks
 
 log = logging.getLogger(__name__)
 

@@ -10,8 +10,6 @@ megabytes of JSON take longer to read than many frames. The event loop is never 
 sends while a frame is worked on. A client that does not read its answers delays nobody and is dropped.
 """
 
-from __future__ import annotations
-
 import asyncio
 import errno
 import logging

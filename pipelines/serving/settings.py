@@ -1,7 +1,5 @@
 """The address and the limits of a service, of its log lines as well."""
 
-from __future__ import annotations
-
 import ipaddress
 import logging
 import time

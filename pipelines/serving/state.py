@@ -21,8 +21,6 @@ arguments; classes that are not loaded are refused. A running graph is made agai
 are the methods of `METHODS` of such objects, by which nonlinear factors are evaluated.
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import json
@@ -40,11 +38,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from data_tools.files.file_access import atomic_file, check_writable, remove_leftovers
+from data_tools.files import atomic_file, check_writable, remove_leftovers
 from pipelines.serving.settings import LogLimit
 from pipelines.serving.stream import StreamTracker
 from saga_fg.errors import InputError
-from saga_fg.graph.scene_factor_graph import GraphRecord, SceneFactorGraph
+from saga_fg.graph import GraphRecord, SceneFactorGraph
 
 PACKAGES = ("saga_fg", "factors")
 METHODS = ("residual", "jacobians", "residual_jacobians")

@@ -1,7 +1,5 @@
 """One stream of messages into one tracker, and the answers to each line."""
 
-from __future__ import annotations
-
 import logging
 import math
 import threading
@@ -27,9 +25,9 @@ from pipelines.serving.messages import (
 from pipelines.serving.settings import LogLimit, StreamSettings
 from pipelines.tracking import OnlineTracker, compared_clocks, resident_memory
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 from saga_fg.tracking import GreedyTracker, SensorTime
-from saga_fg.types.track import Tracks
+from saga_fg.types import Tracks
 
 log = logging.getLogger(__name__)
 

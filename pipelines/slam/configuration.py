@@ -1,7 +1,5 @@
 """The configuration of SLAM, and the options of sensors that take part."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,8 +20,8 @@ from pipelines.slam.localisation import LocaliserSettings
 from pipelines.slam.submaps import Origin
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.model.landmarks import LandmarkDetector
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.model import LandmarkDetector
+from saga_fg.numerics import FloatArray
 from saga_fg.parts import new_part
 from saga_fg.providers.odometry import mounting
 from saga_fg.settings import setting, settings_group

@@ -1,7 +1,5 @@
 """A drive as odometry leaves it: poses of all scans, and motions between them with their covariances."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -11,8 +9,7 @@ import numpy as np
 from data_tools.lidar import Scan
 from pipelines.slam.odometry import OdometryStep
 from saga_fg.errors import InputError, require_type
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import carried_covariance, inverse_transform
+from saga_fg.numerics import FloatArray, carried_covariance, inverse_transform
 
 LEAST = np.diag([1e-4] * 3 + [5e-3] * 3) ** 2  # of a motion: the best accuracy of a registration, rad and m
 

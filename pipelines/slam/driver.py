@@ -21,8 +21,6 @@ deviations. So new objects, whose velocity nobody knows, stay. Detections in ano
 boxes where the scan shows nothing. Where most of the first ones near the sensor are empty, a warning says so.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -32,8 +30,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import ndtr
 
-from data_tools.lidar import Scan, Submap, voxel_downsample
-from data_tools.lidar.scan import inside_boxes, without_objects
+from data_tools.lidar import Scan, Submap, inside_boxes, voxel_downsample, without_objects
 from data_tools.trajectories import Trajectory
 from pipelines.slam.drive import Drive, moved_pose
 from pipelines.slam.loop_closures import ClosedSubmaps, LoopSearch
@@ -42,15 +39,14 @@ from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from pipelines.slam.vehicle_sensors import Vehicle, VehicleSensors
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import checked_transform
+from saga_fg.numerics import FloatArray, IntArray, checked_transform
 from saga_fg.slam.joint import JointEstimate
 from saga_fg.slam.mapping import AssociatedObservation
 from saga_fg.slam.pose_graph import PoseGraph, PosePriors
 from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph, SubmapSettings
 from saga_fg.tracking import Tracker
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.frame import (
+from saga_fg.types import (
+    Boxes,
     Detections,
     EgoMeasurements,
     Frame,

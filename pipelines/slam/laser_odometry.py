@@ -11,8 +11,6 @@ been closed before is searched closely and what has drifted widely. A place that
 wide window waits for another that agrees with it. Along a bare corridor a scan tells no place.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,8 +26,9 @@ from pipelines.slam.loop_closures import Agreement, LoopSearch
 from pipelines.slam.odometry import OdometryStep
 from pipelines.slam.vehicle_sensors import WheelScale
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import (
+from saga_fg.numerics import (
+    FloatArray,
+    IntArray,
     carried_covariance,
     heading,
     in_plane,

@@ -4,8 +4,6 @@ A keyframe comes every half metre or 30 degrees. At the end false loops are foun
 with every other pass of the same place, twice.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -33,8 +31,7 @@ from pipelines.slam.laser_odometry import (
 from pipelines.slam.vehicle_sensors import WheelScale
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray, checked
-from saga_fg.numerics.geometry import in_plane, in_space, moved, transform, vector
+from saga_fg.numerics import FloatArray, IntArray, checked, in_plane, in_space, moved, transform, vector
 from saga_fg.slam.pose_graph import PoseGraph, consensus, trusted
 from saga_fg.slam.pose_graph.consensus import chosen_edges
 from saga_fg.slam.submaps import SubmapSettings

@@ -12,8 +12,6 @@ vehicle is slow, since objects move while it is stationary. Poses are those of t
 its frame. The vehicle's sensors measure between moments, so their factors are made anew from their log.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,9 +19,7 @@ from typing import Literal
 
 import numpy as np
 
-from data_tools.lidar import extract_poles, extract_walls, segment_ground
-from data_tools.lidar.recording import scan_context
-from data_tools.lidar.scan import ScanSequence
+from data_tools.lidar import ScanSequence, extract_poles, extract_walls, scan_context, segment_ground
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
@@ -35,9 +31,8 @@ from pipelines.slam.vehicle_sensors import Vehicle, start_by_fixes
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.model.landmarks import LandmarkDetector, PlaneLandmark, PoleLandmark
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.model import LandmarkDetector, PlaneLandmark, PoleLandmark
+from saga_fg.numerics import FloatArray, inverse_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.slam.joint import JointSettings, OdometryIncrements, OdometryNoise, estimate_jointly
 from saga_fg.slam.joint.record import KEYFRAME_PERIOD, in_ego
@@ -45,7 +40,7 @@ from saga_fg.slam.mapping import LandmarkObservations
 from saga_fg.slam.sensors import sensor_providers
 from saga_fg.slam.submaps import Loops, SubmapSettings
 from saga_fg.tracking import Tracker
-from saga_fg.types.frame import Frame, Observation
+from saga_fg.types import Frame, Observation
 
 WALL = PlaneLandmark(name="wall")
 POLE = PoleLandmark()

@@ -16,8 +16,6 @@ poses since the last comparison are given up. Poses without a known place follow
 them, those at the start backwards from the first.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,17 +23,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_tools.lidar import (
+    PlaceImage,
+    PlaceIndex,
     Registration,
     RegistrationError,
     Scan,
+    ScanSequence,
+    Structure,
     SurfelMap,
     register,
+    scan_context,
     upright,
     voxel_downsample,
 )
-from data_tools.lidar.places import PlaceImage, PlaceIndex, Structure
-from data_tools.lidar.recording import scan_context
-from data_tools.lidar.scan import ScanSequence
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from factors import Robust, pose_prior_factor
@@ -48,12 +48,18 @@ from pipelines.tracking import Progress
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, Additions, FactorProvider
-from saga_fg.numerics.arrays import BoolArray, FloatArray
-from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform, transform_points
+from saga_fg.numerics import (
+    BoolArray,
+    FloatArray,
+    carried_covariance,
+    checked_transform,
+    inverse_transform,
+    transform_points,
+)
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 from saga_fg.slam.mapping import Given, MeasuredMotion, pose_key
 from saga_fg.slam.sensors import SensorConsistency
-from saga_fg.types.frame import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
+from saga_fg.types import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 
 _REGISTERED = 6  # places for each search
 _MAX_RESIDUAL = 0.3  # largest mean distance of the points of a scan from the map, m

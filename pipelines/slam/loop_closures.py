@@ -29,8 +29,6 @@ A loop within the drift of odometry is accepted at once. Any other waits for a s
 the way, that agrees with it: both loops and the odometry between their ends compose to the identity.
 """
 
-from __future__ import annotations
-
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -39,19 +37,21 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from data_tools.lidar import (
+    PlaceImage,
+    PlaceIndex,
+    PlaceMatch,
     Registration,
     RegistrationError,
+    Structure,
     Submap,
     SurfelMap,
+    Undetermined,
     register,
     voxel_downsample,
 )
-from data_tools.lidar.places import PlaceImage, PlaceIndex, PlaceMatch, Structure
-from data_tools.lidar.registration import Undetermined
 from pipelines.slam.drive import LEAST
 from pipelines.slam.submaps import SubmapBuilder, world_T_submap
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import carried_covariance, inverse_transform
+from saga_fg.numerics import FloatArray, IntArray, carried_covariance, inverse_transform
 from saga_fg.settings import Fraction, Positive, Settings, setting
 from saga_fg.slam.pose_graph.consensus import shortest_paths
 from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph

@@ -18,8 +18,6 @@ max(floor, sigma) lose weight. The scheme (constant velocity, adaptive threshold
 al., KISS-ICP, RA-L 2023; planes in place of points need fewer of them, and give the covariance of the pose.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,18 +32,20 @@ from data_tools.lidar import (
     Registration,
     RegistrationError,
     Scan,
+    ScanSequence,
+    Structure,
     SurfelMap,
     constant_velocity,
     deskewed,
     register,
+    upright,
     voxel_downsample,
 )
-from data_tools.lidar.places import Structure, upright
-from data_tools.lidar.scan import ScanSequence
 from data_tools.trajectories import rotation_angle
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, checked
-from saga_fg.numerics.geometry import (
+from saga_fg.numerics import (
+    FloatArray,
+    checked,
     checked_transform,
     inverse_transform,
     transform_points,

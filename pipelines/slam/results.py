@@ -43,8 +43,6 @@ metrics.json errors against the recording's poses, as they are and with the path
 World coordinates are those of the recording (KITTI: x east, y north, z up, from the first pose).
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
@@ -54,10 +52,9 @@ from typing import Any
 import numpy as np
 
 from data_tools.figures import occupancy_picture, paths_from_above, png, scan_map_from_above, write_figures
-from data_tools.files.file_access import atomic_directory, write_bytes, write_text
+from data_tools.files import atomic_directory, write_bytes, write_text
 from data_tools.laser import LaserLog, OccupancyGrid
-from data_tools.lidar import write_cloud
-from data_tools.lidar.scan import ScanSequence
+from data_tools.lidar import ScanSequence, write_cloud
 from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
 from pipelines.slam.driver import SlamResult
@@ -65,11 +62,10 @@ from pipelines.slam.laser_slam import LaserPath
 from pipelines.slam.lidar_slam import WALL, LidarSlamSettings
 from pipelines.slam.localisation import LocalisedDrive
 from pipelines.slam.submaps import Origin, SlamMap, placed_clouds, write_map
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import in_space, inverse_transform, transform_points, transforms
+from saga_fg.numerics import FloatArray, IntArray, in_space, inverse_transform, transform_points, transforms
 from saga_fg.slam.joint import JointEstimate
 from saga_fg.slam.pose_graph import OptimisedPoses, PoseGraph
-from saga_fg.types.frame import Landmark
+from saga_fg.types import Landmark
 
 _CONFIRMED = 5  # detections
 

@@ -11,8 +11,6 @@ origin.csv    latitude [deg], longitude [deg], altitude [m] of the map's origin,
 A submap moves as a whole when its place is estimated anew. Any viewer of point clouds opens the files.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +19,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from data_tools.files.file_access import write_text
-from data_tools.files.readers import TextTable, read_lines
+from data_tools.files import TextTable, read_lines, write_text
 from data_tools.lidar import (
     Submap,
     read_scan,
@@ -31,8 +28,7 @@ from data_tools.lidar import (
     write_cloud,
 )
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import inverse_transform, quaternion_rotation, rotation_quaternion, transform_points
+from saga_fg.numerics import FloatArray, inverse_transform, quaternion_rotation, rotation_quaternion, transform_points
 
 
 class SubmapBuilder:

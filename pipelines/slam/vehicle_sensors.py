@@ -13,8 +13,6 @@ Inertial samples predict each scan: from the pose, velocity and biases of the ne
 preintegration as in `saga_fg.providers.Imu`. The graph has the same samples as factors between keyframes.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,20 +20,17 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
-from data_tools.lidar import Scan
-from data_tools.lidar.recording import scan_context
-from data_tools.lidar.scan import ScanSequence
+from data_tools.lidar import Scan, ScanSequence, scan_context
 from pipelines.slam.odometry import LidarOdometry, Odometry, OdometrySettings, OdometryStep, checked_step
 from saga_fg.errors import InputError
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_BIAS, EGO_POSE, EGO_VELOCITY, FactorProvider
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform, yaw_transform
+from saga_fg.numerics import FloatArray, carried_covariance, checked_transform, inverse_transform, yaw_transform
 from saga_fg.providers import Imu, Wheels
 from saga_fg.providers.navigation import GRAVITY
 from saga_fg.providers.odometry import mounting, on_pose
 from saga_fg.slam.sensors import SensorConsistency, SensorName, SensorSettings, sensor_providers
-from saga_fg.types.frame import Detections, EgoMeasurements, Frame, ImuSamples, WheelSpeed
+from saga_fg.types import Detections, EgoMeasurements, Frame, ImuSamples, WheelSpeed
 
 _LOG = logging.getLogger(__name__)
 

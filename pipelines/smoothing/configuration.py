@@ -6,8 +6,6 @@ of n sensors, and together they tell as much as one.
 Scores of which all lie in [0, 1] are probabilities, whatever the detector's scores are: trackers turn them into such.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,10 +15,10 @@ import numpy as np
 from data_tools.datasets.given_tracks import GivenTracks, sensor_names
 from pipelines.config import TrackConfig, load_config, shipped_settings
 from pipelines.configuration import load_settings, read_settings
-from saga_fg.model.sensor import ScoreCalibration, Sensor, sensor_model
+from saga_fg.model import ScoreCalibration, Sensor, sensor_model
 from saga_fg.settings import settings_group
 from saga_fg.smoothing import SmoothingSettings
-from saga_fg.types.by_class import DEFAULT
+from saga_fg.types import DEFAULT
 
 
 @dataclass(frozen=True)

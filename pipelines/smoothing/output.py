@@ -11,8 +11,6 @@ label_02/        KITTI: text as of ground truth
 results/         KITTI: the same with scores, as evaluators take it
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from itertools import chain
@@ -22,11 +20,11 @@ from tempfile import TemporaryDirectory
 from data_tools.datasets.corrections import write_outcomes
 from data_tools.datasets.detection_files import write_label_table, write_review
 from data_tools.figures import write_figures
-from data_tools.files.file_access import atomic_directory
+from data_tools.files import atomic_directory
 from pipelines.report.page import RunRecord, write_run_record
 from pipelines.smoothing.streaming import SmoothedScene
 from saga_fg.smoothing import LabelCounts, Labels
-from saga_fg.types.dataset import Scene
+from saga_fg.types import Scene
 
 _TABLES = ("labels.csv", "labels.ndjson", "labels.parquet", "review.csv", "corrections.csv", "summary.json", "run.json")
 

@@ -4,8 +4,6 @@ Labels of a recording at hand are kept in memory; those of one that streams by w
 (`saga_fg.smoothing.recording`).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,8 +20,7 @@ from pipelines.tracking import Progress, one_thread, scene_with_frames
 from saga_fg.graph import FactorProvider
 from saga_fg.smoothing import ChunkSettings, LabelBuilder, LabelCounts, LabelModel, Labels, RecordingLabels, Review
 from saga_fg.smoothing.corrections import Correction, corrections_in
-from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.track import Tracks
+from saga_fg.types import Dataset, Scene, Tracks
 
 LabelledParts = Iterable[tuple[Scene, tuple[Labels, ...]]]
 """Parts of a recording, with the labels of each of their timestamps."""

@@ -34,8 +34,6 @@ Results of `saga-fg slam scans` as drawings: paths, the map, landmarks with thei
 Metres, about `origin`.
 """
 
-from __future__ import annotations
-
 import heapq
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -47,16 +45,14 @@ import numpy as np
 
 from data_tools.datasets.source import DatasetSource
 from data_tools.figures import COLOURS, class_colours
-from data_tools.files.file_access import read_bytes
-from data_tools.files.readers import parsed_json
-from data_tools.lidar import read_scan, voxel_downsample
-from data_tools.lidar.scan import ScanSequence
+from data_tools.files import parsed_json, read_bytes
+from data_tools.lidar import ScanSequence, read_scan, voxel_downsample
 from data_tools.metrics import SceneBoxes
 from data_tools.trajectories import Trajectory, read_tum_poses
 from pipelines.report.page import result_scenes
 from pipelines.report.scenes import UNMEASURED, Edges, ReportScene, edges_of_frames, latest_detections
 from saga_fg import Boxes, InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray, checked
+from saga_fg.numerics import FloatArray, IntArray, checked
 
 VEHICLE = (4.6, 1.9, 1.6)  # length, width, height of the box drawn for the vehicle, m
 Colour = tuple[int, int, int]

@@ -14,8 +14,6 @@ Drawings for rerun (https://rerun.io): a file .rrd, written whole or not at all,
 Paths are rerun's entities, frames its transforms; times are on the timelines `time`, s, and `moment`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -23,11 +21,10 @@ from typing import Any, assert_never
 
 import numpy as np
 
-from data_tools.files.file_access import atomic_file, check_writable
+from data_tools.files import atomic_file, check_writable
 from pipelines.view.scenes import Arrows, Drawing, Lines, Points, Pose, Shape, Solids
 from saga_fg.errors import InputError, MissingExtraError
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import rotation_quaternion, yaw_quaternion
+from saga_fg.numerics import FloatArray, IntArray, rotation_quaternion, yaw_quaternion
 
 OPACITY = 0.4  # of solids
 TEXT_SIZE, TEXT_GAP = 12.0, 0.3  # pixels; m above the named thing

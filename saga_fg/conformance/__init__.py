@@ -15,8 +15,6 @@ pytest, `CHECKS` gives a test each:
 `random_program`, `TextbookEstimator` and `assert_equal` are there for tests of one's own.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Iterable, Sequence
 
@@ -47,10 +45,8 @@ from saga_fg.conformance.programs import (
     run,
 )
 from saga_fg.errors import SagaError
-from saga_fg.estimators import Estimator, Measurements
-from saga_fg.estimators.estimator import missing
-from saga_fg.model.discretisation import discretise
-from saga_fg.model.scene_graph import SceneGraph
+from saga_fg.estimators import Estimator, Measurements, missing
+from saga_fg.model import SceneGraph, discretise
 
 __all__ = [
     "CHECKS",

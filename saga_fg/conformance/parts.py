@@ -8,8 +8,6 @@ A check asks the part alone for what its role promises, by random objects, and t
 raises `AssertionError`, or `InputError`, that names the member and what was expected.
 """
 
-from __future__ import annotations
-
 import copy
 from typing import Any, NamedTuple
 
@@ -19,17 +17,29 @@ from factors import Vector
 from factors.manifolds import central_differences
 from saga_fg.conformance.programs import CAR, node_table
 from saga_fg.graph import FactorProvider
-from saga_fg.model.edge_rules import EdgeRule, Pairs
-from saga_fg.model.graph_building import build_graph
-from saga_fg.model.interactions import Interaction, NodeTable
-from saga_fg.model.motion import Motion, NodeType, NonlinearMotion
-from saga_fg.model.nonlinear_interactions import AccelerationLaw
-from saga_fg.model.sensor import ClassModel, Sensor
+from saga_fg.model import (
+    AccelerationLaw,
+    ClassModel,
+    EdgeRule,
+    Interaction,
+    Motion,
+    NodeTable,
+    NodeType,
+    NonlinearMotion,
+    Pairs,
+    Sensor,
+    build_graph,
+)
 from saga_fg.parts import KINDS
-from saga_fg.tracking import AssociationSettings, ClassSettings, Tracker, TrackerSettings
-from saga_fg.tracking.settings import AssociationCost, AssociationProblem
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.tracking import (
+    AssociationCost,
+    AssociationProblem,
+    AssociationSettings,
+    ClassSettings,
+    Tracker,
+    TrackerSettings,
+)
+from saga_fg.types import Boxes, Detections, Frame
 
 OBJECTS, MOMENTS = 6, 8  # that are tracked
 _SLOPE = 1e-5  # relative difference of a derivative from finite differences

@@ -11,9 +11,8 @@ from numpy.typing import ArrayLike
 
 from saga_fg import ConstantAcceleration, ConstantVelocity, Curvilinear, Edges, NodeType, RandomWalk, SceneGraph
 from saga_fg.estimators import Gaussian, Measurements, kalman_predict, kalman_update
-from saga_fg.model.discretisation import Transition, discretise
-from saga_fg.model.interactions import CarFollowing, Interaction, NodeTable, SharedVelocity, applies
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.model import CarFollowing, Interaction, NodeTable, SharedVelocity, Transition, applies, discretise
+from saga_fg.numerics import FloatArray, IntArray
 
 CAR = NodeType("car", ConstantVelocity(acceleration_noise=1.5))
 BUS = NodeType("bus", ConstantAcceleration(jerk_noise=0.4))

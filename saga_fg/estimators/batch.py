@@ -5,8 +5,6 @@ it is solved when somebody asks for an estimate. Residual functions of one famil
 (`factors.solve`). A last step by QR brings back the digits that Cholesky leaves behind, unless cliques are wide.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterable, Sequence
 from functools import cached_property
@@ -17,12 +15,18 @@ import numpy as np
 from factors import FactorError, SolverSettings, linearised, marginal_moments, solve
 from factors.gaussian import Elimination, block_covariances, singular_system
 from saga_fg.errors import require_type
-from saga_fg.graph.factor_checks import solver_error
-from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
-from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.graph.variables import GraphError, LinearisationPoint
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.types.frame import Frame
+from saga_fg.graph import (
+    FactorProvider,
+    GraphError,
+    GraphView,
+    LinearisationPoint,
+    SceneFactorGraph,
+    ask,
+    predictors,
+    solver_error,
+)
+from saga_fg.numerics import FloatArray
+from saga_fg.types import Frame
 
 _WIDE = 400  # dimensions of a clique from which QR takes ten times as long as Cholesky
 

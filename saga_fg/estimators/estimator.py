@@ -18,8 +18,6 @@ What is read of it comes from `posterior`; copies and snapshots copy all attribu
 methods may change arrays in place.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass
@@ -32,12 +30,11 @@ from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.measurements import Measurements, Observations
 from saga_fg.estimators.object_factors import prior_graph
 from saga_fg.estimators.partition import BlockGaussian
-from saga_fg.graph.providers import FactorProvider
-from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.graph import FactorProvider, SceneFactorGraph
 from saga_fg.kernels.components import planar_marginals
-from saga_fg.model.discretisation import Transition
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.types.frame import Frame
+from saga_fg.model import Transition
+from saga_fg.numerics import BoolArray, FloatArray, IntArray
+from saga_fg.types import Frame
 
 ESSENTIAL = ("time", "add", "predict", "update", "marginalise", "posterior")
 """Methods that every estimator has."""

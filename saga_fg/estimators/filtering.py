@@ -29,8 +29,8 @@ from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.measurements import LinearisedMeasurements
 from saga_fg.estimators.partition import BlockGaussian, Partition, StateLayout, unflattened
 from saga_fg.kernels.filtering import corrected_state, predicted_state, tie_strengths
-from saga_fg.model.discretisation import Blocks, Transition
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.model import Blocks, Transition
+from saga_fg.numerics import BoolArray, FloatArray, IntArray
 
 CANCELLATION = 1e-6  # ratio of variances after and before below which a correction is refined
 

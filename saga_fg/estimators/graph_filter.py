@@ -41,12 +41,10 @@ from saga_fg.estimators.measurements import Measured, Measurements, Observations
 from saga_fg.estimators.object_factors import DetectionFactors, Interactions
 from saga_fg.estimators.partition import BlockGaussian, StateLayout, checked_prior, not_smaller
 from saga_fg.estimators.smoother import SmoothedState
-from saga_fg.graph.providers import FactorProvider, predictors
-from saga_fg.graph.scene_factor_graph import WIDE, SceneFactorGraph
-from saga_fg.graph.variables import MAP_NODE, OBJECT, node_key
-from saga_fg.model.discretisation import Transition
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, shallow_copy
-from saga_fg.types.frame import Frame
+from saga_fg.graph import MAP_NODE, OBJECT, WIDE, FactorProvider, SceneFactorGraph, node_key, predictors
+from saga_fg.model import Transition
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, checked, shallow_copy
+from saga_fg.types import Frame
 
 _RELEASE_EVERY = 10  # predictions between looks for objects whose correlation with others has decayed
 

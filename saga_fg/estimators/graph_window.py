@@ -20,10 +20,9 @@ from saga_fg.estimators.filtering import Dynamics
 from saga_fg.estimators.independent import IndependentObjects
 from saga_fg.estimators.partition import BlockGaussian, Partition, StateLayout
 from saga_fg.estimators.smoother import SmoothedState
-from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.graph.variables import node_key
-from saga_fg.model.discretisation import Transition
-from saga_fg.numerics.arrays import BoolArray, FloatArray, checked
+from saga_fg.graph import SceneFactorGraph, node_key
+from saga_fg.model import Transition
+from saga_fg.numerics import BoolArray, FloatArray, checked
 
 SAME_TIME = 1e-9  # s
 LEFT = "marginalise"  # the call by which nodes leave

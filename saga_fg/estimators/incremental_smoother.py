@@ -27,11 +27,19 @@ from saga_fg.estimators.batch import GraphSolution
 from saga_fg.estimators.interval_dynamics import joint_gaussian
 from saga_fg.estimators.isam2_engine import Engine, RelinearisationSettings
 from saga_fg.estimators.partition import BlockGaussian, StateLayout
-from saga_fg.graph.providers import FactorProvider, GraphView, OtherVariables, ask, predictors
-from saga_fg.graph.scene_factor_graph import Condensation, SceneFactorGraph
-from saga_fg.graph.variables import GraphError, LinearisationPoint
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.types.frame import Frame
+from saga_fg.graph import (
+    Condensation,
+    FactorProvider,
+    GraphError,
+    GraphView,
+    LinearisationPoint,
+    OtherVariables,
+    SceneFactorGraph,
+    ask,
+    predictors,
+)
+from saga_fg.numerics import FloatArray
+from saga_fg.types import Frame
 
 
 class IncrementalSmoother:

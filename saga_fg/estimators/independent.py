@@ -24,9 +24,8 @@ from saga_fg.estimators.interval_dynamics import LARGEST_RATIO, merged
 from saga_fg.estimators.measurements import Measurements
 from saga_fg.estimators.object_factors import component_priors, measurement_factors
 from saga_fg.estimators.partition import UNCORRELATED, BlockGaussian, StateLayout
-from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.graph.variables import GraphVariable, NewVariable, VariableKind, node_key, node_kind
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.graph import GraphVariable, NewVariable, SceneFactorGraph, VariableKind, node_key, node_kind
+from saga_fg.numerics import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,13 +36,19 @@ from factors.validation import KeyArray
 from saga_fg.errors import InputError
 from saga_fg.estimators.filtering import Dynamics, noise_ratio, predict
 from saga_fg.estimators.partition import BlockGaussian, Partition, StateLayout, zeros
-from saga_fg.graph.factor_checks import solver_error, with_names
-from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.model.discretisation import Blocks, Transition, discretise
-from saga_fg.model.interactions import POSITION, VELOCITY
-from saga_fg.model.motion import NodeType, NonlinearMotion
-from saga_fg.model.nonlinear_interactions import AccelerationLaw, held
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
+from saga_fg.graph import SceneFactorGraph, solver_error, with_names
+from saga_fg.model import (
+    POSITION,
+    VELOCITY,
+    AccelerationLaw,
+    Blocks,
+    NodeType,
+    NonlinearMotion,
+    Transition,
+    discretise,
+    held,
+)
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, checked
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,11 +27,8 @@ import scipy.linalg
 from factors import FactorError, SingularSystemError, marginal_moments
 from factors.gaussian import Elimination, block_covariances, native_factor, singular_system
 from saga_fg.estimators.relinearisation import Displacements, solve_damped
-from saga_fg.graph.factor_checks import solver_error
-from saga_fg.graph.factor_groups import HeldGroup
-from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.graph.variables import GraphError, UndeterminedError, insert_state
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.graph import GraphError, HeldGroup, SceneFactorGraph, UndeterminedError, insert_state, solver_error
+from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.settings import NonNegative, Positive, Range, Settings, setting
 
 _FEW = 24  # variables that GTSAM eliminates as quickly one after the other

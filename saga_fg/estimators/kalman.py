@@ -42,13 +42,23 @@ from saga_fg.estimators.interval_dynamics import IntervalDynamics, replace_by_pr
 from saga_fg.estimators.measurements import Measured, Measurements, Observations
 from saga_fg.estimators.object_factors import prior_graph
 from saga_fg.estimators.partition import BlockGaussian, StateLayout, checked_prior
-from saga_fg.graph.factor_checks import solver_error
-from saga_fg.graph.providers import FactorProvider, GraphView, ask, predictors
-from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.graph.variables import GraphError, GraphVariable, LinearisationPoint, NewVariable, insert_state, node_kind
-from saga_fg.model.discretisation import Transition
-from saga_fg.numerics.arrays import FloatArray, IntArray, shallow_copy
-from saga_fg.types.frame import Frame
+from saga_fg.graph import (
+    FactorProvider,
+    GraphError,
+    GraphVariable,
+    GraphView,
+    LinearisationPoint,
+    NewVariable,
+    SceneFactorGraph,
+    ask,
+    insert_state,
+    node_kind,
+    predictors,
+    solver_error,
+)
+from saga_fg.model import Transition
+from saga_fg.numerics import FloatArray, IntArray, shallow_copy
+from saga_fg.types import Frame
 
 _NO_ROWS = np.empty(0, dtype=np.int64)
 _UNDETERMINED = 1e-12  # share of its column that is left of a variable which the factors do not determine

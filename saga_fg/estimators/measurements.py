@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from factors import FactorError, MeasurementModel
 from saga_fg.errors import InputError
 from saga_fg.estimators.partition import StateLayout
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_covariances, checked_rows
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, checked, checked_covariances, checked_rows
 
 
 class LinearisedMeasurements(NamedTuple):

@@ -8,8 +8,6 @@ A node that nothing moves or disturbs, such as a pole, keeps the variable of the
 noise has no factor.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -32,11 +30,9 @@ from saga_fg.errors import InputError
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.measurements import Measured, Measurements, Observations
 from saga_fg.estimators.partition import BlockGaussian, StateLayout
-from saga_fg.graph.providers import Additions, GraphView
-from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.graph.variables import NewVariable, node_key, node_kind
-from saga_fg.model.discretisation import Blocks, Transition
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.graph import Additions, GraphView, NewVariable, SceneFactorGraph, node_key, node_kind
+from saga_fg.model import Blocks, Transition
+from saga_fg.numerics import BoolArray, FloatArray, IntArray
 
 _SINGULAR = 1e-13  # share of the variances of axes below which a direction has none
 Factors = list[gtsam.JacobianFactor | GaussianFactors | ResidualFactors]

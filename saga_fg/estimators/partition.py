@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError, UnknownNodeError
 from saga_fg.kernels.components import component_tables, regrouped_blocks, uncorrelated_labels, united_labels
-from saga_fg.numerics.arrays import (
+from saga_fg.numerics import (
     BoolArray,
     FloatArray,
     IntArray,

@@ -4,13 +4,11 @@ Everything else in the package is measured against these functions, in correctne
 Kirubarajan 2001, sections 5.2 and 8.6; Rauch, Tung, Striebel 1965).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 
 
 class Gaussian(NamedTuple):

@@ -10,8 +10,6 @@ next step is still longer than the threshold,
 in standard deviations of its marginal covariance P_kk. The others of its component have, even so.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterable, KeysView, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,11 +18,8 @@ import gtsam
 import numpy as np
 
 from factors import FactorError, SingularSystemError, Solution, SolverSettings, solve
-from saga_fg.graph.factor_checks import solver_error
-from saga_fg.graph.factor_groups import ActiveRows, HeldGroup
-from saga_fg.graph.scene_factor_graph import SceneFactorGraph
-from saga_fg.graph.variables import insert_state
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.graph import ActiveRows, HeldGroup, SceneFactorGraph, insert_state, solver_error
+from saga_fg.numerics import FloatArray, IntArray
 
 _MAX_STEPS = 60
 _LEAST_TOLERANCE = 1e-4  # sigma; Levenberg-Marquardt's last steps are shorter than rounding lets them be below

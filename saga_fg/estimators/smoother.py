@@ -23,8 +23,6 @@ smoothed means until these stand still (Bell, The iterated Kalman smoother as a 
 Optimization 4, 1994).
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -40,8 +38,8 @@ from saga_fg.estimators.filtering import ComponentBounds, Dynamics, corrected, p
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
 from saga_fg.estimators.measurements import Measurements, Observations
 from saga_fg.estimators.partition import BlockDiagonal, BlockGaussian, Partition, StateLayout, checked_prior, regrouped
-from saga_fg.model.discretisation import Transition
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.model import Transition
+from saga_fg.numerics import FloatArray, IntArray
 
 log = logging.getLogger(__name__)
 

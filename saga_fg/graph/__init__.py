@@ -1,8 +1,18 @@
 """The running graph: one factor graph of objects, the vehicle and landmarks, fed by factor providers."""
 
-from saga_fg.graph.factor_groups import FactorEntry
-from saga_fg.graph.providers import Additions, FactorProvider, GraphView, ask_all, predictors
-from saga_fg.graph.scene_factor_graph import SceneFactorGraph
+from saga_fg.graph.factor_checks import Factor, solver_error, stacked, with_names
+from saga_fg.graph.factor_groups import ActiveRows, FactorEntry, HeldGroup, PriorGroup
+from saga_fg.graph.providers import (
+    Additions,
+    FactorProvider,
+    Factors,
+    GraphView,
+    OtherVariables,
+    ask,
+    ask_all,
+    predictors,
+)
+from saga_fg.graph.scene_factor_graph import WIDE, Condensation, GraphRecord, SceneFactorGraph
 from saga_fg.graph.variables import (
     EGO_BIAS,
     EGO_ERROR,
@@ -13,11 +23,15 @@ from saga_fg.graph.variables import (
     OBJECT,
     GraphError,
     GraphVariable,
+    LinearisationPoint,
     NewVariable,
     ProviderError,
     UndeterminedError,
     VariableKind,
+    insert_state,
     key_of,
+    node_key,
+    node_kind,
 )
 
 __all__ = [
@@ -28,18 +42,35 @@ __all__ = [
     "LANDMARK",
     "MAP_NODE",
     "OBJECT",
+    "WIDE",
+    "ActiveRows",
     "Additions",
+    "Condensation",
+    "Factor",
     "FactorEntry",
     "FactorProvider",
+    "Factors",
     "GraphError",
+    "GraphRecord",
     "GraphVariable",
     "GraphView",
+    "HeldGroup",
+    "LinearisationPoint",
     "NewVariable",
+    "OtherVariables",
+    "PriorGroup",
     "ProviderError",
     "SceneFactorGraph",
     "UndeterminedError",
     "VariableKind",
+    "ask",
     "ask_all",
+    "insert_state",
     "key_of",
+    "node_key",
+    "node_kind",
     "predictors",
+    "solver_error",
+    "stacked",
+    "with_names",
 ]

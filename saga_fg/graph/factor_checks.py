@@ -11,8 +11,6 @@ GTSAM reads beyond the end of a vector of another dimension than its factor's, a
 that least squares cannot take, and takes a `LinearContainerFactor` without a linearisation point for one at any point.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -37,7 +35,7 @@ from factors.validation import format_key
 from saga_fg.errors import InputError
 from saga_fg.graph.factor_groups import FactorGroup, HeldGroup, LinearGroup, NativeGroup, ResidualGroup, members
 from saga_fg.graph.variables import GraphError, GraphVariable, UndeterminedError, described
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics import FloatArray, IntArray
 
 Factor = gtsam.JacobianFactor | GaussianFactors | ResidualFactors | gtsam.NonlinearFactor | gtsam.NonlinearFactorGraph
 Variables = Mapping[int, GraphVariable]

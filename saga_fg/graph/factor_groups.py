@@ -28,7 +28,7 @@ from factors import (
 from factors.gaussian import nonlinear_graph_at, whitened_factors
 from factors.validation import KeyArray, format_keys
 from saga_fg.graph.variables import LARGEST_INCREMENT, GraphError, GraphVariable, LinearisationPoint
-from saga_fg.numerics.arrays import BoolArray, IntArray
+from saga_fg.numerics import BoolArray, IntArray
 
 Rows = tuple[tuple[int, ...], ...]
 

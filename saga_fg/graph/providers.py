@@ -26,9 +26,9 @@ import numpy as np
 from saga_fg.graph.factor_checks import Factor, each_factor, mentioned_keys, with_names
 from saga_fg.graph.scene_factor_graph import SceneFactorGraph
 from saga_fg.graph.variables import GraphError, GraphVariable, NewVariable, ProviderError, VariableKind, key_of
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 from saga_fg.parts import part_kind
-from saga_fg.types.frame import Frame
+from saga_fg.types import Frame
 
 Factors = Sequence[Factor] | gtsam.NonlinearFactorGraph
 

@@ -59,7 +59,7 @@ from saga_fg.graph.variables import (
     key_of,
     variable_type,
 )
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics import FloatArray, IntArray
 
 
 class Condensation(Protocol):

@@ -40,7 +40,7 @@ import numpy as np
 from factors import FactorError, ImuBias, OrientedPlane, PlanarPose, SpatialPose, Variable, Vector
 from factors.gaussian import native_factor
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 
 
 class GraphError(InputError):

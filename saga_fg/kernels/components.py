@@ -6,8 +6,6 @@ The block of a component of size s begins at its `start`; the covariance of node
 offset[i] and offset[j], at start + s offset[i] + offset[j], with rows s apart. See `saga_fg.estimators.partition`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

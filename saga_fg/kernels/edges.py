@@ -6,8 +6,6 @@ Of E pairs: rows `target` (E,), ascending, and `source` (E,) of n nodes, and whe
 target: ahead, aside, direction there, and whether the path is a predicted one (E,).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

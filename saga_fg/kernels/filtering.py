@@ -7,8 +7,6 @@ Blocks of F between parts of the components are inputs that are taken for indepe
 F_ij P_jj F_ij^T. Measurements come one after the other.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ r"""Exponentials of many small matrices and the integrals over them, see `saga_f
 Matrices are mostly zeros, which their products leave out.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

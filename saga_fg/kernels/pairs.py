@@ -1,7 +1,5 @@
 """Pairs of tracks and measurements, or of tracks and their returns: gates, costs, overlap of boxes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

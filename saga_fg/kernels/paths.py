@@ -1,7 +1,5 @@
 """Predicted paths: along trails and courses, turn rates, and places on them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

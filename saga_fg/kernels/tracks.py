@@ -1,7 +1,5 @@
 """What is estimated track by track: boxes, stationarity, first speeds, going on, and probabilities of associations."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

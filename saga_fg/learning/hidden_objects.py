@@ -29,23 +29,24 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
 from saga_fg.estimators import Estimator
-from saga_fg.model.discretisation import Transition
-from saga_fg.model.edge_rules import EdgeRule, Pairs
-from saga_fg.model.interactions import Interaction, NodeTable
-from saga_fg.model.modes import Mixture
-from saga_fg.model.nonlinear_interactions import AccelerationLaw
-from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
-from saga_fg.numerics.assignment import assign
-from saga_fg.tracking import Tracker, TrackerSettings
-from saga_fg.tracking.joint_state import JointTrackState
-from saga_fg.tracking.map_nodes import motion_of
-from saga_fg.tracking.prediction import predict
-from saga_fg.tracking.track_filters import MOVING, Kinematics
-from saga_fg.tracking.track_table import SensorEvidence, TrackTable
-from saga_fg.tracking.tracker_state import TrackerState
-from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings
-from saga_fg.types.dataset import LabelledObjects, Scene
+from saga_fg.model import AccelerationLaw, EdgeRule, Interaction, Mixture, NodeTable, Pairs, Sensor, Transition
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, assign
+from saga_fg.tracking import (
+    MOVING,
+    JointTrackState,
+    Kinematics,
+    Passages,
+    SensorEvidence,
+    Tracker,
+    TrackerSettings,
+    TrackerState,
+    TrackTable,
+    Traffic,
+    TrafficSettings,
+    motion_of,
+    predict,
+)
+from saga_fg.types import LabelledObjects, Scene
 
 
 class Marginals(Estimator):

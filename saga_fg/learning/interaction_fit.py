@@ -10,8 +10,6 @@ objective is minimised by L-BFGS-B with differences for derivatives: one predict
 second, and rules may be anybody's. A Gaussian prior about the template decides where the recordings do not.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -22,12 +20,10 @@ from scipy.optimize import minimize
 
 from saga_fg.errors import InputError
 from saga_fg.learning.hidden_objects import GapPrediction, HiddenObjects
-from saga_fg.model.edge_rules import Neighbours, traffic_rules
-from saga_fg.model.interactions import CarFollowing
-from saga_fg.model.nonlinear_interactions import IntelligentDriver
-from saga_fg.numerics.arrays import FloatArray, StrArray
+from saga_fg.model import CarFollowing, IntelligentDriver, Neighbours, traffic_rules
+from saga_fg.numerics import FloatArray, StrArray
 from saga_fg.tracking import TrackerSettings
-from saga_fg.types.by_class import VEHICLES
+from saga_fg.types import VEHICLES
 
 Rule = Any
 """An edge rule whose settings `rate` and `..._scale` are learned where they are finite."""

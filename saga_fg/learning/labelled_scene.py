@@ -25,14 +25,10 @@ import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.learning.process_noise import MeasuredTrajectory
-from saga_fg.model.sensor import Sensor, sensor_model
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
-from saga_fg.numerics.assignment import assign
-from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.tracking.class_belief import ConfusedClasses
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations, LabelledObjects, Scene
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.model import Sensor, sensor_model
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, assign, wrap_angle
+from saga_fg.tracking import ConfusedClasses
+from saga_fg.types import Annotations, Boxes, Detections, Frame, LabelledObjects, Scene
 
 REACH = 2.0  # m, from an object to its detections
 MIN_STEP = 0.05  # s, between two detections of an object

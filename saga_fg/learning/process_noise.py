@@ -29,12 +29,10 @@ import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
 from saga_fg.errors import InputError
-from saga_fg.model.discretisation import own_motion
-from saga_fg.model.motion import ConstantVelocity, Curvilinear, Motion, NodeType
-from saga_fg.model.turning import KnownCourses
-from saga_fg.numerics.arrays import FloatArray, IntArray, checked
-from saga_fg.tracking.track_filters import MOVING, TurnRate
-from saga_fg.types.by_class import DEFAULT
+from saga_fg.model import ConstantVelocity, Curvilinear, KnownCourses, Motion, NodeType, own_motion
+from saga_fg.numerics import FloatArray, IntArray, checked
+from saga_fg.tracking import MOVING, TurnRate
+from saga_fg.types import DEFAULT
 
 FEWEST_OBJECTS = 10  # a class with fewer has the noise of all objects together
 WRONG_REACH = 4.0  # m

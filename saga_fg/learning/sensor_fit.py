@@ -31,8 +31,6 @@ that are a share `MIN_SHARE` of the detections of a class at least.
 Rows are counts, which tell how frequent the classes are as well (`saga_fg.tracking.class_belief`).
 """
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
@@ -43,13 +41,10 @@ from scipy.optimize import minimize
 
 from saga_fg.errors import InputError
 from saga_fg.learning.labelled_scene import GATE, DetectionSample, SampledDetections, SampledObjects, match_to_truth
-from saga_fg.model.sensor import FieldOfView, NoiseModel, ScoreCalibration, Sensor, sensor_model
-from saga_fg.numerics.arrays import BoolArray, FloatArray
-from saga_fg.numerics.assignment import assign
-from saga_fg.tracking.class_belief import ConfusedClasses
-from saga_fg.tracking.settings import TypicalSize
-from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.dataset import Scene
+from saga_fg.model import FieldOfView, NoiseModel, ScoreCalibration, Sensor, sensor_model
+from saga_fg.numerics import BoolArray, FloatArray, assign
+from saga_fg.tracking import ConfusedClasses, TypicalSize
+from saga_fg.types import DEFAULT, Scene
 
 PRIOR = NoiseModel(position=0.2, range_noise=0.005, bearing_noise=0.005, low_score_growth=0.3)
 PRIOR_WIDTH = 1.0  # of the logarithms

@@ -17,8 +17,6 @@ belong to no such trajectory count as false. The tracker's word stands for the t
 passes for an object, and an object detected only now and then for clutter.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -31,14 +29,10 @@ from scipy.optimize import minimize
 from saga_fg.learning.labelled_scene import DetectionSample, SampledDetections, SampledObjects
 from saga_fg.learning.process_noise import MeasuredTrajectory, innovation_likelihood
 from saga_fg.learning.sensor_fit import FEWEST, MIN_PARAMETER, PRIOR_WIDTH, robust_deviation
-from saga_fg.model.sensor import NoiseModel, Sensor, sensor_model
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
-from saga_fg.numerics.assignment import Assignment
-from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.model import NoiseModel, Sensor, sensor_model
+from saga_fg.numerics import Assignment, FloatArray, IntArray, StrArray, wrap_angle
 from saga_fg.tracking import Tracker
-from saga_fg.types.by_class import class_settings
-from saga_fg.types.dataset import Scene
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.types import Detections, Frame, Scene, class_settings
 
 FEWEST_DETECTIONS = 5  # of a trajectory that counts as an object
 DETECTED_SHARE = 0.5  # of the frames in which it was in view, at least

@@ -31,8 +31,6 @@ is a polynomial in s (constant velocity, constant acceleration), F_ij = sum_k dt
 otherwise F_ij is read off the exponential of the block matrix [[M_i, K_ij A_other], [0, A_j]] (Van Loan 1978).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,7 +43,7 @@ from saga_fg.errors import InputError
 from saga_fg.kernels.matrix_functions import coupling_integrals, phi_and_noise, with_edges, with_motions
 from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, unchecked
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, unchecked
 
 
 @dataclass(frozen=True, eq=False)

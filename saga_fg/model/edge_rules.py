@@ -34,8 +34,6 @@ Edges go both ways: each takes on the other's velocity and keeps its place relat
 correct the other as well. From one interval to the next the offset may turn with the pair.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -66,8 +64,7 @@ from saga_fg.model.nonlinear_interactions import (
     SocialForce,
     nearest_offset,
 )
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
-from saga_fg.numerics.geometry import near_pairs, wrap_angle
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, near_pairs, of_classes, wrap_angle
 from saga_fg.parts import part_kind
 from saga_fg.settings import (
     NonNegative,
@@ -77,7 +74,7 @@ from saga_fg.settings import (
     setting,
     settings_group,
 )
-from saga_fg.types.by_class import VEHICLES
+from saga_fg.types import VEHICLES
 
 CONES = ("traffic_cone", "barrier")  # classes of objects that form a line
 CLEARANCE = 1.75  # c, m, usual 1.5 to 2: half a vehicle and half a metre or more

@@ -6,8 +6,6 @@ in position and velocity, from the estimates at the start of the interval (other
 are taken as 0: edges act on them by nothing). As F has the sparsity of the graph, only the edges into i matter for i.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -21,7 +19,7 @@ from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, a
 from saga_fg.model.motion import distinct_types
 from saga_fg.model.nonlinear_interactions import held
 from saga_fg.model.scene_graph import Edges, NonlinearEdges, RecordedMotions, SceneGraph
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked, checked_rows, unchecked
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, checked, checked_rows, unchecked
 
 Governing = Callable[[int, NodeTable, IntArray, IntArray], FloatArray]
 _MAX_EXPLAINED = 20.0  # exponent: a billionth of the noise stays, and F P F^T + Q is no more singular than that

@@ -31,7 +31,7 @@ import numpy as np
 
 from saga_fg.kernels.paths import path_cones, places_along
 from saga_fg.model.motion import NodeType
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray, unchecked
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, unchecked
 from saga_fg.parts import part_kind
 from saga_fg.settings import (
     NonNegative,
@@ -39,7 +39,7 @@ from saga_fg.settings import (
     Settings,
     setting,
 )
-from saga_fg.types.road_map import LanesAcross
+from saga_fg.types import LanesAcross
 
 SHARP = 1.2  # rad, turn from which nothing is said about where a path is
 _ROUNDING = 1 + 1e-9

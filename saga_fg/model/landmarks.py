@@ -5,8 +5,6 @@ Planes: walls, facades, the ground.
 The state is n . x + d = 0 in the world, n of length 1 pointing to the side that is seen.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -24,10 +22,10 @@ from factors import (
     relative_factors,
 )
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.parts import part_kind
 from saga_fg.settings import Positive, Settings, setting
-from saga_fg.types.frame import Frame, Observation
+from saga_fg.types import Frame, Observation
 
 
 @part_kind("detector of landmarks", "saga_fg.landmarks")

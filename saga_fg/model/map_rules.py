@@ -80,11 +80,9 @@ from saga_fg.model.nonlinear_interactions import (
     accelerated,
     speed_along,
 )
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, of_classes
-from saga_fg.numerics.geometry import direction_at, feet, on_it, wrap_angle
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, direction_at, feet, of_classes, on_it, wrap_angle
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
-from saga_fg.types.by_class import VEHICLES
-from saga_fg.types.road_map import LANE, LIGHT, STOP_LINE, LanesAcross
+from saga_fg.types import LANE, LIGHT, STOP_LINE, VEHICLES, LanesAcross
 
 SIDE_BY_SIDE = 1.8  # m; vehicles that cross a line further apart are in different lanes
 PAST = 2.0  # m; a vehicle waits at a line with its front up to this far beyond it

@@ -45,7 +45,7 @@ from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, NodeType
 from saga_fg.model.scene_graph import OwnMotions, SceneGraph
 from saga_fg.model.turning import CoordinatedTurn
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 
 _UNUSED_DEVIATION = 0.3  # standard deviation of a component, in its unit, while its mode does not use it

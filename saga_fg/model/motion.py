@@ -9,8 +9,6 @@ A type names its state components ("x", "vx", ...), so that sensors and interact
 nodes of different types, with states of different size, live in one graph.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray, checked
+from saga_fg.numerics import FloatArray, IntArray, checked
 from saga_fg.parts import part_kind
 from saga_fg.settings import Fraction, NonNegative, PositiveOrInf, Settings, setting
 

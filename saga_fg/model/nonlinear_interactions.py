@@ -54,7 +54,7 @@ from scipy.special import expit, softmax
 
 from factors.measurement import soft_distance
 from saga_fg.model.interactions import POSITION, VELOCITY, Needs, NodeTable, Triples, unit, velocity_triples
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics import BoolArray, FloatArray, IntArray
 from saga_fg.parts import part_kind
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 

@@ -21,7 +21,7 @@ import numpy as np
 from saga_fg.errors import InputError
 from saga_fg.model.motion import NodeType, distinct_types
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
-from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_ids, checked_rows
+from saga_fg.numerics import FloatArray, IntArray, checked, checked_ids, checked_rows
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,8 +21,6 @@ order. A pixel is |J e_u| wide at the foot, and as high, as objects stand uprigh
 Source: Hartley and Zisserman, Multiple View Geometry, 2004, sections 8.1 and 5.2 (first-order propagation).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -32,8 +30,7 @@ import numpy as np
 
 from saga_fg.errors import InputError, require_type
 from saga_fg.kernels.components import measured_covariances
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, checked, distinct
-from saga_fg.numerics.geometry import wrap_angle, yaw_transform
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray, checked, distinct, wrap_angle, yaw_transform
 from saga_fg.parts import part_kind
 from saga_fg.settings import (
     Finite,
@@ -46,9 +43,7 @@ from saga_fg.settings import (
     setting,
     settings_group,
 )
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.by_class import DEFAULT, class_values
-from saga_fg.types.frame import LATEST, Detections, Frame
+from saga_fg.types import DEFAULT, LATEST, Boxes, Detections, Frame, class_values
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,6 @@ Interactions learned from recordings, as a value that is written to a file and g
 Learned dynamics must be stable: construction checks them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -36,7 +34,7 @@ from saga_fg.model.interactions import NodeTable, applies, unit
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.model.scene_graph import Edges, SceneGraph
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 from saga_fg.settings import Range, Settings, setting, settings_group
 
 LONGEST_STEP = 1.0  # s

@@ -60,7 +60,7 @@ from saga_fg.kernels.paths import course_inputs, course_motions
 from saga_fg.model.discretisation import linear_motions
 from saga_fg.model.motion import Curvilinear, NodeType
 from saga_fg.model.scene_graph import OwnMotions
-from saga_fg.numerics.arrays import Columns, FloatArray, IntArray, unchecked
+from saga_fg.numerics import Columns, FloatArray, IntArray, unchecked
 from saga_fg.settings import NonNegative, Settings, setting
 
 _TINY = 1e-2  # rad; below, series

@@ -6,8 +6,6 @@ Every public value type funnels its arrays through `checked`, so that nothing of
 number is needed, ever reaches the numerics (or GTSAM, which would crash the interpreter).
 """
 
-from __future__ import annotations
-
 import weakref
 from collections.abc import Container, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self, TypeVar

@@ -17,8 +17,6 @@ samples.
 The sensor may sit anywhere on the vehicle (`mounted`).
 """
 
-from __future__ import annotations
-
 import logging
 import math
 from dataclasses import dataclass
@@ -30,13 +28,11 @@ import numpy as np
 
 from factors import PlanarPose, Robust, SpatialPose, prior_factor, residual_factor
 from saga_fg.errors import InputError
-from saga_fg.graph.providers import Additions, GraphView
-from saga_fg.graph.variables import EGO_BIAS, EGO_POSE, EGO_VELOCITY, NewVariable
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import chi_square_quantile
+from saga_fg.graph import EGO_BIAS, EGO_POSE, EGO_VELOCITY, Additions, GraphView, NewVariable
+from saga_fg.numerics import FloatArray, chi_square_quantile
 from saga_fg.providers.odometry import NO_POSE, ON_THE_POSE, Mounting, StartSettings, mounting
 from saga_fg.settings import Fraction, Positive, PositiveOrInf, Settings, setting, settings_group
-from saga_fg.types.frame import ImuSamples
+from saga_fg.types import ImuSamples
 
 _LOG = logging.getLogger(__name__)
 GRAVITY = 9.81  # m/s^2, which differs by 0.3 % at most from place to place, less than a bias

@@ -14,8 +14,6 @@ The speed of the vehicle by its wheels: they roll ahead, and slide neither sidew
 X is the place of the axle that does not steer, v the mean speed by the wheels.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import partial
@@ -34,12 +32,10 @@ from factors import (
     residual_factor,
 )
 from saga_fg.errors import InputError
-from saga_fg.graph.providers import Additions, GraphView
-from saga_fg.graph.variables import EGO_POSE, NewVariable
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import yaw_of, yaw_transform
+from saga_fg.graph import EGO_POSE, Additions, GraphView, NewVariable
+from saga_fg.numerics import FloatArray, yaw_of, yaw_transform
 from saga_fg.settings import Fraction, Positive, Settings, setting, settings_group
-from saga_fg.types.frame import Frame, OdometryIncrement
+from saga_fg.types import Frame, OdometryIncrement
 
 NO_POSE = "expected a provider that adds the vehicle's pose before it, such as saga_fg.providers:Odometry"
 

@@ -9,8 +9,6 @@ it, a variable for all time with a prior. The loss is robust: it lets go of obje
 shrinks with the length of the interval, so that a second has the same weight at any rate of frames.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -18,17 +16,12 @@ import numpy as np
 
 from factors import ResidualFactors, Robust, prior_factor, relative_factors
 from saga_fg.errors import InputError
-from saga_fg.graph.factor_checks import Factor
-from saga_fg.graph.providers import Additions, GraphView
-from saga_fg.graph.variables import EGO_POSE, LANDMARK, MAP_NODE, OBJECT, NewVariable
-from saga_fg.model.landmarks import PointLandmark
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import feet, on_it
+from saga_fg.graph import EGO_POSE, LANDMARK, MAP_NODE, OBJECT, Additions, Factor, GraphView, NewVariable
+from saga_fg.model import PointLandmark
+from saga_fg.numerics import FloatArray, IntArray, feet, on_it
 from saga_fg.providers.odometry import NO_POSE
 from saga_fg.settings import Positive, Settings, setting, settings_group
-from saga_fg.types.by_class import VEHICLES
-from saga_fg.types.frame import Observation
-from saga_fg.types.road_map import Lane
+from saga_fg.types import VEHICLES, Lane, Observation
 
 ALONG = 0.9  # cosine of the angle between a course and a lane within which an object goes along it
 MIN_SPEED = 1.0  # m/s; slower vehicles keep to no lane

@@ -35,8 +35,6 @@ as `prior` opportunities without a detection. A lone detection scores low, howev
 mean.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -44,16 +42,20 @@ from typing import Any
 
 import numpy as np
 
-from saga_fg.model.sensor import Sensor, sensor_model
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.numerics.assignment import gate, least_total, mahalanobis_of_pairs
-from saga_fg.numerics.geometry import near_pairs
+from saga_fg.model import Sensor, sensor_model
+from saga_fg.numerics import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    StrArray,
+    gate,
+    least_total,
+    mahalanobis_of_pairs,
+    near_pairs,
+)
 from saga_fg.smoothing.states import Lifespans, StateTable, lifespans_of
-from saga_fg.tracking.class_belief import ConfusedClasses
-from saga_fg.tracking.measurements import frame_measurements
-from saga_fg.tracking.settings import ClassSettings
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.frame import Frame
+from saga_fg.tracking import ClassSettings, ConfusedClasses, frame_measurements
+from saga_fg.types import Boxes, Frame
 
 
 @dataclass(frozen=True, eq=False)

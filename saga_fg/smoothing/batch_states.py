@@ -31,8 +31,6 @@ positions measured meanwhile do not drift: with the weighted regression
 the drift |u*| T over its duration T is below `stationary_drift`. A parked vehicle is stationary all its life.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -50,15 +48,12 @@ from saga_fg.estimators import (
     SmoothedState,
 )
 from saga_fg.graph import OBJECT, Additions, FactorProvider, GraphView, key_of
-from saga_fg.model.discretisation import Transition, discretise
-from saga_fg.model.interactions import VELOCITY
-from saga_fg.model.motion import NodeType
-from saga_fg.model.scene_graph import SceneGraph
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.model import VELOCITY, NodeType, SceneGraph, Transition, discretise
+from saga_fg.numerics import BoolArray, FloatArray, IntArray
 from saga_fg.smoothing.association import Evidence
 from saga_fg.smoothing.settings import OfflineClass
 from saga_fg.smoothing.states import Lifespans, StateTable
-from saga_fg.types.by_class import class_settings, class_values
+from saga_fg.types import class_settings, class_values
 
 log = logging.getLogger(__name__)
 

@@ -26,16 +26,13 @@ continuously over all turns.
 Source: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 8.6.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, wrap_angle
 from saga_fg.smoothing.association import Evidence
 from saga_fg.smoothing.states import Lifespans, StateTable
 

@@ -4,8 +4,6 @@ Corrections are taken in the order given, each about an object as smoothed so fa
 the others bring about, such as a box that moved an object to where a later correction says it is.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from saga_fg.graph import FactorProvider
-from saga_fg.model.sensor import FieldOfView, Sensor
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.numerics.geometry import near_pairs
+from saga_fg.model import FieldOfView, Sensor
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, near_pairs
 from saga_fg.smoothing.association import Evidence, EvidenceFrame, assign_free_detections, evidence_scores
 from saga_fg.smoothing.batch_states import StationaryStates, stationary_states
 from saga_fg.smoothing.corrections import Correction, Place, WholeObject
@@ -23,7 +20,7 @@ from saga_fg.smoothing.passes import ASSOCIATION_GATE, EXTENSION, MAX_FREE_DISTA
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME, SmoothingSettings
 from saga_fg.smoothing.states import Lifespans, StateTable
 from saga_fg.tracking import TrackerSettings
-from saga_fg.types.boxes import Boxes
+from saga_fg.types import Boxes
 
 PERSON = Sensor(field_of_view=FieldOfView(max_range=1e-9))  # who looks at one object misses no other
 REACH = 2.0  # between a place and the object that it names, m

@@ -24,9 +24,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE
-from saga_fg.types.frame import LATEST
+from saga_fg.numerics import FloatArray
+from saga_fg.types import LATEST, MAX_POSITION, MAX_SIZE
 
 What = Literal["exists", "class", "same", "box", "standing", "size"]
 SIZE = ("length", "width", "height")

@@ -20,18 +20,15 @@ A false object is one error, and so are a wrong class and a wrong join; every bo
 Boxes without a heading are not turned round.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
-from saga_fg.numerics.geometry import near_pairs
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, near_pairs
 from saga_fg.smoothing.association import Evidence
 from saga_fg.smoothing.states import Lifespans, Probabilities, StateTable
-from saga_fg.types.track import data_frame, text_table
+from saga_fg.types import data_frame, text_table
 
 HANDED_OUT = 0.5  # P(exists)
 LEAST_GAIN = 0.05  # of an object that is worth a look

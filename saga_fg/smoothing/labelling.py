@@ -9,8 +9,6 @@ was part of an object before stays so: the object keeps the name of its tracklet
 of the tracklet that reaches furthest towards the chunk, so that an object's name does not change across the boundary.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import chain
@@ -18,7 +16,7 @@ from typing import get_args
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray
 from saga_fg.smoothing.association import Evidence
 from saga_fg.smoothing.boxes import (
     Headings,
@@ -34,9 +32,7 @@ from saga_fg.smoothing.doubt import step_doubt
 from saga_fg.smoothing.passes import SmoothedObjects
 from saga_fg.smoothing.settings import OfflineClass, SmoothingSettings
 from saga_fg.smoothing.states import Labels, Probabilities, Source, StateTable, quality_of
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.by_class import class_values
-from saga_fg.types.track import Tracks
+from saga_fg.types import Boxes, Tracks, class_values
 
 NEAR_CORRECTION = 1.0  # time to a corrected box up to which a label is near one, s
 HEIGHT_DRIFT = 0.1  # standard deviation of a centre's height after one second, m

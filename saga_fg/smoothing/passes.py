@@ -12,16 +12,14 @@ A weak tracklet never takes a detection from a strong object, but it is not drop
 are weak. Its low score puts it at the end of the ranking.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from saga_fg.graph import FactorProvider
-from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.model import Sensor
+from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.parts import new_part
 from saga_fg.smoothing.association import (
     Evidence,
@@ -43,10 +41,8 @@ from saga_fg.smoothing.batch_states import (
 from saga_fg.smoothing.boxes import constant_sizes, size_weights
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME, SmoothingSettings
 from saga_fg.smoothing.states import MEDIUM_SCORE, Lifespans, SmoothedEdges, StateTable
-from saga_fg.tracking import GreedyTracker, Tracker, TrackerSettings
-from saga_fg.tracking.settings import ClassSettings
-from saga_fg.types.by_class import class_values
-from saga_fg.types.frame import Frame
+from saga_fg.tracking import ClassSettings, GreedyTracker, Tracker, TrackerSettings
+from saga_fg.types import Frame, class_values
 
 _REWEIGHTINGS = 1  # repetitions of loss weights and edges at the final states
 ASSOCIATION_GATE = 0.95  # gate probability of detections without a track; higher: more are added, right and wrong

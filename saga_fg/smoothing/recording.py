@@ -16,8 +16,6 @@ Labels are written for the moments of the chunk alone; beyond the margins measur
 and work follow the detections in a chunk and its margins, so that crowds are cut into shorter ones.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,8 +25,8 @@ from typing import Annotated
 import numpy as np
 
 from saga_fg.graph import FactorProvider
-from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.model import Sensor
+from saga_fg.numerics import BoolArray, FloatArray, IntArray
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.smoothing.association import Evidence, gather_evidence, measured_in_order, opportunities
 from saga_fg.smoothing.boxes import size_weights
@@ -45,9 +43,8 @@ from saga_fg.smoothing.passes import SmoothedObjects, smooth_objects, track_evid
 from saga_fg.smoothing.recording_labels import LabelParts, RecordingLabels
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME, SmoothingSettings
 from saga_fg.smoothing.states import LabelCounts
-from saga_fg.tracking import GreedyTracker, Tracker, TrackerSettings
-from saga_fg.tracking.noise_scale import scaled_sensors
-from saga_fg.types.frame import Frame
+from saga_fg.tracking import GreedyTracker, Tracker, TrackerSettings, scaled_sensors
+from saga_fg.types import Frame
 
 MIN_LENGTH = 5.0  # s, of a chunk that ends early: below the margins at its ends, which are smoothed again, take over
 

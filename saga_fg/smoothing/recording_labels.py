@@ -1,7 +1,5 @@
 """The labels of a whole recording, each with what is known of its object, and the objects by what a look is worth."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import pairwise
@@ -9,8 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.numerics import FloatArray, IntArray, wrap_angle
 from saga_fg.smoothing.boxes import is_reversed
 from saga_fg.smoothing.doubt import LEAST_GAIN, REASONS, Review, far_off, gain_parts, object_probabilities
 from saga_fg.smoothing.labelling import LabelColumns, LabelledStates, ObjectSummary, median_sizes, source_counts

@@ -1,14 +1,12 @@
 """Settings of offline smoothing."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 from factors import Robust
 from saga_fg.graph import FactorProvider
-from saga_fg.model.motion import ConstantVelocity
+from saga_fg.model import ConstantVelocity
 from saga_fg.settings import (
     Fraction,
     NonNegative,
@@ -17,7 +15,7 @@ from saga_fg.settings import (
     setting,
     settings_group,
 )
-from saga_fg.types.by_class import DEFAULT
+from saga_fg.types import DEFAULT
 
 LOSS_SCALE = 2.0  # residual from which the loss departs from a square, standard deviations
 PRIOR_OPPORTUNITY_TIME = 1.0  # missed opportunities that each object starts with, as a time, s

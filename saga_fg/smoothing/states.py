@@ -16,14 +16,10 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.model.edge_rules import EdgeRule
-from saga_fg.model.graph_building import build_graph
-from saga_fg.model.interactions import NodeTable
-from saga_fg.model.motion import NodeType
-from saga_fg.model.scene_graph import SceneGraph
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
-from saga_fg.tables.columns import PROBABILITIES
-from saga_fg.types.track import Tracks
+from saga_fg.model import EdgeRule, NodeTable, NodeType, SceneGraph, build_graph
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray
+from saga_fg.tables import PROBABILITIES
+from saga_fg.types import Tracks
 
 
 @dataclass(frozen=True, eq=False)

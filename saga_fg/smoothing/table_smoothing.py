@@ -1,7 +1,5 @@
 """Labels of a whole table of detections in one call, beside `saga_fg.track`."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,16 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from saga_fg.model.sensor import Sensor
+from saga_fg.model import Sensor
 from saga_fg.smoothing.corrections import Correction, checked_corrections, corrections_in, unfit
 from saga_fg.smoothing.recording import LabelBuilder, LabelModel
 from saga_fg.smoothing.recording_labels import RecordingLabels
 from saga_fg.smoothing.settings import SmoothingSettings
 from saga_fg.smoothing.states import Labels
-from saga_fg.tables.column_names import TableImport
-from saga_fg.tables.detections import Table, raw_table, scenes_of, table_like
-from saga_fg.tracking import Tracker, TrackerSettings
-from saga_fg.tracking.table_tracking import UNKNOWN_SENSORS, check_scenes
+from saga_fg.tables import Table, TableImport, raw_table, scenes_of, table_like
+from saga_fg.tracking import UNKNOWN_SENSORS, Tracker, TrackerSettings, check_scenes
 
 
 @dataclass(frozen=True, eq=False)

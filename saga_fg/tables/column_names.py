@@ -21,9 +21,9 @@ from typing import Any, Literal
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 from saga_fg.settings import Settings, setting, settings_group
-from saga_fg.types.dataset import FILL_IN, Finding, Mend
+from saga_fg.types import FILL_IN, Finding, Mend
 
 Kind = Literal["time", "length", "speed", "angle", "score"]
 FACTORS: Mapping[Kind, Mapping[str, float]] = {

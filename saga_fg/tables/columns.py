@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray, checked_quaternions, quaternion_rotation, yaw_of
 from saga_fg.tables.column_names import (
     ISO,
     Clock,
@@ -25,9 +24,17 @@ from saga_fg.tables.column_names import (
     seconds_of_dates,
 )
 from saga_fg.tables.plausibility import days_taken_for_times, frames_taken_for_seconds
-from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE, MAX_SPEED
-from saga_fg.types.dataset import FILL_IN, Finding
-from saga_fg.types.frame import LATEST, EgoMeasurements, GpsFix, OdometryIncrement
+from saga_fg.types import (
+    FILL_IN,
+    LATEST,
+    MAX_POSITION,
+    MAX_SIZE,
+    MAX_SPEED,
+    EgoMeasurements,
+    Finding,
+    GpsFix,
+    OdometryIncrement,
+)
 
 REQUIRED = ("timestamp", "x", "y")
 BOX = ("z", "length", "width", "height", "yaw", "vx", "vy", "range_rate", "score")

@@ -5,8 +5,6 @@ that was measured, and objects move less in the world than in the frame of a veh
 only where another convention explains the data much better.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,8 +13,7 @@ from typing import Self
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.numerics.geometry import wrap_angle, yaw_of
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray, wrap_angle, yaw_of
 from saga_fg.tables.plausibility import (
     FEWEST,
     far_too_fast,
@@ -28,9 +25,7 @@ from saga_fg.tables.plausibility import (
     usual_class,
     within_a_metre,
 )
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Finding, Mend
-from saga_fg.types.frame import Frame
+from saga_fg.types import Boxes, Finding, Frame, Mend
 
 MAX_FRAMES = 200
 MIN_STEP = 1e-6  # s between two frames, of which a velocity can be told

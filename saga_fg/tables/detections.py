@@ -1,7 +1,5 @@
 """Tables of detections as recordings; those of programs too, of pandas, Polars or Arrow."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,8 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from saga_fg.errors import InputError, error_context, require_type, unknown_name
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, from_upper_triangle
-from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray, from_upper_triangle, yaw_transform
 from saga_fg.tables.column_names import Clock, TableImport, understood
 from saga_fg.tables.columns import (
     BOX,
@@ -30,9 +27,7 @@ from saga_fg.tables.columns import (
     clock_of,
 )
 from saga_fg.tables.conventions import Sample, findings_of
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Finding, Mend, Scene, refuse_contradictions
-from saga_fg.types.frame import Coordinates, Detections, Frame
+from saga_fg.types import Boxes, Coordinates, Detections, Finding, Frame, Mend, Scene, refuse_contradictions
 
 _COORDINATES = ("world", "ego", "sensor", "camera")
 JUDGED = 3  # scenes of a table

@@ -3,18 +3,14 @@
 Checks return a `Finding` or None. Thresholds are such that the recordings of the tests raise none.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterable, Sequence
 from difflib import get_close_matches
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.types.by_class import VEHICLES
-from saga_fg.types.dataset import FILL_IN, Finding, Mend
-from saga_fg.types.frame import Frame
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray
+from saga_fg.types import FILL_IN, VEHICLES, Finding, Frame, Mend
 
 _WORDS = {
     "pedestrian": "pedestrian pedestrians person people human walker adult child",

@@ -1,38 +1,77 @@
+from .by_name import estimator_parameters
+from .class_belief import ConfusedClasses
 from .clock import TimeVerdict
 from .clock_offsets import SensorTime
+from .dense_traffic import dense_traffic_settings
 from .greedy import GreedySettings, GreedyTracker
 from .identity_tracking import IdentityTracker
-from .journal import Journal, Observer, Stage, TrackerView
+from .joint_state import JointTrackState
+from .journal import Event, Journal, Observer, Stage, TrackerView, of_scene
+from .map_nodes import motion_of
+from .measurements import frame_measurements
+from .noise_scale import scaled_sensors
+from .prediction import predict
 from .settings import (
+    AssociationCost,
     AssociationName,
+    AssociationProblem,
     AssociationSettings,
     ClassSettings,
     EgoNodeSettings,
     ExistenceSettings,
     TrackerSettings,
+    TypicalSize,
 )
-from .table_tracking import track
+from .table_tracking import UNKNOWN_SENSORS, check_scenes, track
+from .track_filters import MOVING, Kinematics, TurnRate
+from .track_table import SensorEvidence, TrackTable
 from .tracker import Tracker
-from .traffic import SpeedPriorSettings, TrafficSettings
+from .tracker_state import TrackerState
+from .traffic import Passages, SpeedPriorSettings, Traffic, TrafficSettings
+from .visibility import visible_share
 
 __all__ = [
+    "MOVING",
+    "UNKNOWN_SENSORS",
+    "AssociationCost",
     "AssociationName",
+    "AssociationProblem",
     "AssociationSettings",
     "ClassSettings",
+    "ConfusedClasses",
     "EgoNodeSettings",
+    "Event",
     "ExistenceSettings",
     "GreedySettings",
     "GreedyTracker",
     "IdentityTracker",
+    "JointTrackState",
     "Journal",
+    "Kinematics",
     "Observer",
+    "Passages",
+    "SensorEvidence",
     "SensorTime",
     "SpeedPriorSettings",
     "Stage",
     "TimeVerdict",
+    "TrackTable",
     "Tracker",
     "TrackerSettings",
+    "TrackerState",
     "TrackerView",
+    "Traffic",
     "TrafficSettings",
+    "TurnRate",
+    "TypicalSize",
+    "check_scenes",
+    "dense_traffic_settings",
+    "estimator_parameters",
+    "frame_measurements",
+    "motion_of",
+    "of_scene",
+    "predict",
+    "scaled_sensors",
     "track",
+    "visible_share",
 ]

@@ -43,17 +43,20 @@ import numpy as np
 from saga_fg.errors import InputError
 from saga_fg.kernels.pairs import gated_pairs
 from saga_fg.kernels.tracks import association_marginals
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, common_numbers
-from saga_fg.numerics.assignment import (
+from saga_fg.numerics import (
+    BoolArray,
     CrossCovariances,
+    FloatArray,
+    IntArray,
     Matching,
     QuadraticMatching,
     cheapest_first,
+    common_numbers,
     gate,
     least_total,
+    near_pairs,
     pair_costs,
 )
-from saga_fg.numerics.geometry import near_pairs
 from saga_fg.parts import of_own_code
 from saga_fg.tracking.class_belief import NONE_CONFUSED, ConfusedClasses
 from saga_fg.tracking.given_identities import identity_cost
@@ -62,8 +65,7 @@ from saga_fg.tracking.relinking import relinked
 from saga_fg.tracking.settings import AssociationProblem, AssociationSettings, ClassSettings, TrackerSettings
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.unresolved import over_confirmed
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.by_class import class_values
+from saga_fg.types import Boxes, class_values
 
 EXISTENCE_WEIGHT, SCORE_WEIGHT = 0.3, 0.5  # a and b above
 MIN_CLUTTER = 0.05  # least expected number of false detections of a class in a frame

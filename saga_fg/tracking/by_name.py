@@ -5,15 +5,12 @@ What makes it is called with those of the tracker's settings that its parameters
 `max_component`, ...), and with the factor `providers`, if it names them.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 from saga_fg.errors import InputError
-from saga_fg.estimators import Estimator, GraphFilter, JointKalmanFilter
-from saga_fg.estimators.estimator import missing
+from saga_fg.estimators import Estimator, GraphFilter, JointKalmanFilter, missing
 from saga_fg.graph import FactorProvider
 from saga_fg.parts import find, made, part_kind, require_name
 

@@ -33,8 +33,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.model.sensor import ClassModel, Sensor
-from saga_fg.numerics.arrays import (
+from saga_fg.model import ClassModel, Sensor
+from saga_fg.numerics import (
     BoolArray,
     FloatArray,
     IntArray,
@@ -46,8 +46,7 @@ from saga_fg.numerics.arrays import (
 )
 from saga_fg.parts import new_part
 from saga_fg.tracking.settings import ClassSettings
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.by_class import DEFAULT, class_settings
+from saga_fg.types import DEFAULT, Boxes, class_settings
 
 MIN_BELIEF = 1e-3  # of a class of the group
 MIN_CONFUSION = 1e-3  # chance of any report within the group

@@ -33,7 +33,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from saga_fg.numerics.arrays import unchecked
+from saga_fg.numerics import unchecked
 
 MAX_JUMP = 10.0  # s, as a tracker starts with
 RESET_AFTER = 3  # frames in a row in which the time of a sensor decreases, and that set the clock back

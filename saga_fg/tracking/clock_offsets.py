@@ -30,7 +30,7 @@ from typing import Literal
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray
+from saga_fg.numerics import BoolArray, FloatArray, StrArray
 from saga_fg.tracking.clock import Clock, weighted_median
 from saga_fg.tracking.measurements import FrameMeasurements
 

@@ -5,16 +5,11 @@ A track that is not detected goes on along its path: that of earlier traffic whe
 and its leaders are found. All is found anew for every interval and recorded with it (`saga_fg.model.turning`).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from saga_fg.kernels.paths import mean_courses
-from saga_fg.model.interactions import Paths
-from saga_fg.model.motion import Curvilinear
-from saga_fg.model.turning import KnownCourses, Unseen, turning_time
-from saga_fg.numerics.arrays import BoolArray, FloatArray, unchecked
-from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.model import Curvilinear, KnownCourses, Paths, Unseen, turning_time
+from saga_fg.numerics import BoolArray, FloatArray, unchecked, wrap_angle
 from saga_fg.tracking.track_filters import MOVING, TURNING
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.traffic import STEP, paths

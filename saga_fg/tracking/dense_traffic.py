@@ -5,18 +5,12 @@ to the trails of those before it, and does what its leader does (`saga_fg.tracki
 chosen on half of the windows of two recorded roads, and confirmed on the others.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
-from saga_fg.model.edge_rules import Following
-from saga_fg.model.interactions import SharedVelocity
-from saga_fg.model.map_rules import GreenLight, RedLight, Stopping
-from saga_fg.model.motion import ConstantVelocity, Curvilinear
+from saga_fg.model import ConstantVelocity, Curvilinear, Following, GreenLight, RedLight, SharedVelocity, Stopping
 from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
 from saga_fg.tracking.traffic import TrafficSettings
-from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.road_map import SignalSettings
+from saga_fg.types import DEFAULT, SignalSettings
 
 
 @cache

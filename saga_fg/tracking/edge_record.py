@@ -31,11 +31,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from saga_fg.model.edge_rules import EdgeRule
-from saga_fg.model.graph_building import Governing, build_graph
-from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, unit
-from saga_fg.model.scene_graph import SceneGraph
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.model import POSITION, VELOCITY, EdgeRule, Governing, NodeTable, SceneGraph, build_graph, unit
+from saga_fg.numerics import BoolArray, FloatArray, IntArray
 from saga_fg.tracking.halting_places import HaltingPlaces
 
 HORIZON, MAX_HORIZON = 1.0, 2.0  # s, of a trial

@@ -15,15 +15,12 @@ Source: Reid, An Algorithm for Tracking Multiple Targets, IEEE Transactions on A
 hypotheses those of one pair alone.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
-from saga_fg.numerics.assignment import mahalanobis_of_pairs
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, mahalanobis_of_pairs
 
 LIKELY, UNLIKELY = 2.0, -5.0  # log odds; 1.5 to 2.5 exchange alike
 MEMORY = 2.0  # s; 1 to 3 exchange alike

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics import FloatArray, IntArray
 
 STAYING = 0.9  # q; labels from the tracks of nuScenes are alike from 0.75 to 0.9
 _NOBODY = np.empty(0, dtype=np.int64)

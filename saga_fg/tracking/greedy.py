@@ -13,16 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from saga_fg.errors import require_type
-from saga_fg.model.sensor import Sensor, checked_sensors, sensor_model
-from saga_fg.numerics.arrays import Columns, FloatArray, IntArray, StrArray
-from saga_fg.numerics.geometry import near_pairs
+from saga_fg.model import Sensor, checked_sensors, sensor_model
+from saga_fg.numerics import Columns, FloatArray, IntArray, StrArray, near_pairs
 from saga_fg.settings import PositiveOrInf, Settings, setting, settings_group
 from saga_fg.tracking.clock import MAX_JUMP, Clock, TimeVerdict
 from saga_fg.tracking.clock_offsets import SensorTime, SharedObservations, sensor_times
-from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
-from saga_fg.types.by_class import DEFAULT, class_numbers
-from saga_fg.types.frame import Frame
-from saga_fg.types.track import Tracks
+from saga_fg.types import DEFAULT, MAX_POSITION, MAX_SPEED, Boxes, Frame, Tracks, class_numbers
 
 MAX_DELAY = 0.5  # s; older frames are left out
 BASELINE = 0.2  # s, least time between two positions whose difference gives a velocity; shorter: noise

@@ -18,10 +18,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from saga_fg.model.interactions import NodeTable, ahead_and_aside, unit
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, of_classes
-from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.types.by_class import VEHICLES
+from saga_fg.model import NodeTable, ahead_and_aside, unit
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, of_classes, wrap_angle
+from saga_fg.types import VEHICLES
 
 STANDING = 0.6  # s
 STILL, LEAVES = 0.5, 1.5  # m/s: slower vehicles stand; from this speed on they have left

@@ -1,7 +1,5 @@
 """A tracker in the place of those that number detections: `update(detections)`, as of supervision and `trackers`."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping
 from typing import Any, TypeVar
@@ -9,12 +7,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.model.sensor import GroundCamera, Sensor
-from saga_fg.numerics.arrays import IntArray, checked
+from saga_fg.model import GroundCamera, Sensor
+from saga_fg.numerics import IntArray, checked
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.table_tracking import UNNAMED
 from saga_fg.tracking.tracker import Tracker
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.types import Detections, Frame
 
 D = TypeVar("D")
 SENSOR = "camera"

@@ -5,12 +5,9 @@ traffic around it (`saga_fg.tracking.traffic`). Returns of lost objects are left
 (`saga_fg.tracking.relinking`); a new track over another one is tentative (`saga_fg.tracking.unresolved`).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.assignment import Matching
+from saga_fg.numerics import FloatArray, IntArray, Matching
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.relinking import CONFIRMING, initiating
 from saga_fg.tracking.track_filters import BoxFilter, Kinematics, Stationarity, TurnRate, after_evidence, log_density
@@ -18,7 +15,7 @@ from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.unresolved import unresolved_frames
 from saga_fg.tracking.update import update_range_rates
-from saga_fg.types.boxes import Boxes
+from saga_fg.types import Boxes
 
 
 def initiate_tracks(state: TrackerState, measurements: FrameMeasurements, matching: Matching) -> IntArray:

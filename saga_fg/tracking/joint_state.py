@@ -23,17 +23,12 @@ import numpy as np
 
 from saga_fg.estimators import Estimator, Measurements
 from saga_fg.graph import EGO_POSE, SceneFactorGraph, key_of
-from saga_fg.model.discretisation import discretise, own_motion
-from saga_fg.model.interactions import POSITION, VELOCITY
-from saga_fg.model.modes import Mixture, ModeTable
-from saga_fg.model.motion import Motion, NodeType
-from saga_fg.model.scene_graph import SceneGraph
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, distinct, shallow_copy
-from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.model import POSITION, VELOCITY, Mixture, ModeTable, Motion, NodeType, SceneGraph, discretise, own_motion
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray, distinct, shallow_copy, yaw_transform
 from saga_fg.providers import RelativeDetections
 from saga_fg.tracking.given_identities import exchanged
 from saga_fg.tracking.track_filters import Kinematics, RelativePositions
-from saga_fg.types.frame import Frame
+from saga_fg.types import Frame
 
 
 def moved_to_present(node_type: NodeType, H: FloatArray, R: FloatArray, delay: float) -> tuple[FloatArray, FloatArray]:

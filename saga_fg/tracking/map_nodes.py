@@ -40,19 +40,22 @@ from typing import TypeVar
 
 import numpy as np
 
-from saga_fg.model.edge_rules import EdgeRule
-from saga_fg.model.interactions import NodeTable
-from saga_fg.model.map_rules import GreenLight, RedLight, coming_vehicles, halting
-from saga_fg.model.motion import Motion, RandomWalk
-from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray, of_classes
-from saga_fg.numerics.assignment import assign, gate, mahalanobis
+from saga_fg.model import (
+    EdgeRule,
+    GreenLight,
+    Motion,
+    NodeTable,
+    RandomWalk,
+    RedLight,
+    Sensor,
+    coming_vehicles,
+    halting,
+)
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, assign, gate, mahalanobis, of_classes
 from saga_fg.tracking.joint_state import JointTrackState
 from saga_fg.tracking.settings import ClassSettings, TrackerSettings
 from saga_fg.tracking.track_filters import Kinematics
-from saga_fg.types.by_class import class_settings
-from saga_fg.types.frame import Frame
-from saga_fg.types.road_map import (
+from saga_fg.types import (
     COLOUR_LABELS,
     COLOURS,
     LANE,
@@ -63,6 +66,7 @@ from saga_fg.types.road_map import (
     STATES,
     STOP_LINE,
     WALL,
+    Frame,
     Lane,
     LanesAcross,
     RoadMap,
@@ -70,6 +74,7 @@ from saga_fg.types.road_map import (
     StopLine,
     TrafficLight,
     Wall,
+    class_settings,
     colour_updated,
     colours,
     updated,

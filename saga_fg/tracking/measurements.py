@@ -28,27 +28,24 @@ import numpy as np
 from factors import relative_factors
 from saga_fg.errors import InputError
 from saga_fg.graph import EGO_POSE, key_of
-from saga_fg.model.interactions import POSITION, NodeTable
-from saga_fg.model.sensor import MAX_MEASURED_SPEED, Sensor
-from saga_fg.numerics.arrays import (
+from saga_fg.model import MAX_MEASURED_SPEED, POSITION, NodeTable, Sensor
+from saga_fg.numerics import (
     BoolArray,
     FloatArray,
     IntArray,
     StrArray,
     checked,
     checked_covariances,
+    near_pairs,
     of_classes,
     unchecked,
+    yaw_of,
 )
-from saga_fg.numerics.geometry import near_pairs, yaw_of
 from saga_fg.tracking.class_belief import NONE_CONFUSED, ConfusedClasses
 from saga_fg.tracking.joint_state import JointTrackState
 from saga_fg.tracking.settings import ClassSettings, EgoNodeSettings, TrackerSettings
 from saga_fg.tracking.track_filters import MOVING, Kinematics, RelativePositions
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.by_class import class_settings, class_values
-from saga_fg.types.frame import Frame
-from saga_fg.types.road_map import COLOUR_LABELS
+from saga_fg.types import COLOUR_LABELS, Boxes, Frame, class_settings, class_values
 
 WEAK_RATIO = 0.5  # of probabilities, below which a detection near another one is much weaker
 UNKNOWN_YAW_NOISE = np.pi  # standard deviation where nothing was measured, rad

@@ -27,9 +27,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from saga_fg.model.sensor import NoiseModel, Sensor, sensor_model
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.assignment import Matching, gate, mahalanobis_of_pairs
+from saga_fg.model import NoiseModel, Sensor, sensor_model
+from saga_fg.numerics import FloatArray, IntArray, Matching, gate, mahalanobis_of_pairs
 from saga_fg.tracking.measurements import FrameMeasurements
 
 ORDERS = (1, 2, 3)

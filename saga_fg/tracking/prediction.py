@@ -19,21 +19,18 @@ since whether an object is stationary is its own affair; the mean and the block 
 detections (`saga_fg.tracking.reporting`), which soon are the smaller part.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 
 import numpy as np
 
-from saga_fg.model.graph_building import build_graph
-from saga_fg.model.interactions import NodeTable, Paths
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.model import NodeTable, Paths, build_graph
+from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.tracking.courses import known_courses, predicted_paths
 from saga_fg.tracking.edge_record import answers
 from saga_fg.tracking.reporting import reported_rows, untrackable
 from saga_fg.tracking.tracker_state import TrackerState
-from saga_fg.types.track import PredictedTracks
+from saga_fg.types import PredictedTracks
 
 log = logging.getLogger(__name__)
 

@@ -41,8 +41,6 @@ Source: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking
 tests whether two tracks are of one object, and their fusion, errors taken for independent.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -50,9 +48,8 @@ import numpy as np
 
 from saga_fg.kernels.pairs import relinking_pairs, return_evidence, returned_pairs
 from saga_fg.kernels.tracks import log_peaks
-from saga_fg.model.interactions import POSITION, VELOCITY
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray
-from saga_fg.numerics.assignment import Matching, least_total, mahalanobis_of_pairs
+from saga_fg.model import POSITION, VELOCITY
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, Matching, StrArray, least_total, mahalanobis_of_pairs
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.tracker_state import LIFETIME, TrackerState
 

@@ -28,21 +28,18 @@ at most for `max_coasting`. Neighbours that are still detected keep its place kn
 marginalised, so that their information on their neighbours stays.
 """
 
-from __future__ import annotations
-
 import logging
 from typing import Any
 
 import numpy as np
 
 from saga_fg.kernels.components import biased_covariances
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, unchecked
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, unchecked
 from saga_fg.tracking.relinking import relinkable
 from saga_fg.tracking.settings import ExistenceSettings
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.tracker_state import TrackerState
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.track import Tracks
+from saga_fg.types import Boxes, Tracks
 
 LASTING_SHARE = 0.3  # of the best detection's probability, which later boxes score at least; 0.2 to 0.5 rank alike
 

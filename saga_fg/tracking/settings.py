@@ -1,7 +1,5 @@
 """Settings of the trackers."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,21 +7,29 @@ from typing import Annotated, Literal, NamedTuple, Protocol
 
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
-from saga_fg.model.edge_rules import Attached, EdgeRule, Following, Neighbours, Repulsion, traffic_rules
-from saga_fg.model.map_rules import ConeLine, GreenLight, InLane, RedLight
-from saga_fg.model.modes import Mixture
-from saga_fg.model.motion import (
+from saga_fg.model import (
+    AccelerationLaw,
+    Attached,
+    ConeLine,
     ConstantAcceleration,
     ConstantVelocity,
+    CoordinatedTurn,
     Curvilinear,
+    EdgeRule,
+    Following,
+    GreenLight,
+    InLane,
+    Mixture,
     Motion,
+    Neighbours,
     NonlinearMotion,
     RandomWalk,
+    RedLight,
+    Repulsion,
+    require_stable,
+    traffic_rules,
 )
-from saga_fg.model.nonlinear_interactions import AccelerationLaw
-from saga_fg.model.stability import require_stable
-from saga_fg.model.turning import CoordinatedTurn
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.parts import part_kind
 from saga_fg.settings import (
     Fraction,
@@ -41,9 +47,7 @@ from saga_fg.settings import (
 from saga_fg.tracking.by_name import EstimatorMaker, require_estimator
 from saga_fg.tracking.clock import MAX_JUMP
 from saga_fg.tracking.traffic import TrafficSettings
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.road_map import RoadMap, SignalSettings
+from saga_fg.types import DEFAULT, Boxes, RoadMap, SignalSettings
 
 AssociationName = Literal["hungarian", "greedy", "graph"]
 

@@ -1,25 +1,27 @@
 """Tracking of a whole table of detections in one call, which refuses one whose contents contradict how it is read."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
 
-from saga_fg.model.edge_rules import acting_classes
-from saga_fg.model.sensor import Sensor, sensor_model
-from saga_fg.tables.column_names import TableImport
-from saga_fg.tables.columns import RawTable
-from saga_fg.tables.detections import Table, raw_table, scenes_of, table_like, tell
-from saga_fg.tables.plausibility import idle_rules, seems_dense_traffic
+from saga_fg.model import Sensor, acting_classes, sensor_model
+from saga_fg.tables import (
+    RawTable,
+    Table,
+    TableImport,
+    idle_rules,
+    raw_table,
+    scenes_of,
+    seems_dense_traffic,
+    table_like,
+    tell,
+)
 from saga_fg.tracking.dense_traffic import dense_traffic_settings
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.tracker import Tracker
-from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.dataset import Scene
-from saga_fg.types.track import Tracks
+from saga_fg.types import DEFAULT, Scene, Tracks
 
 UNKNOWN_SENSORS: Mapping[str, Sensor] = {DEFAULT: Sensor(calibrate_noise=True)}
 """Models of sensors of which nothing is known: their detections tell how noisy they are."""

@@ -65,11 +65,16 @@ from saga_fg.kernels.tracks import (
     updated_boxes,
     updated_places,
 )
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
-from saga_fg.numerics.assignment import mahalanobis_of_pairs
-from saga_fg.numerics.geometry import inverse_transform, transform_points
-from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED
-from saga_fg.types.track import speed_deviation
+from saga_fg.numerics import (
+    BoolArray,
+    Columns,
+    FloatArray,
+    IntArray,
+    inverse_transform,
+    mahalanobis_of_pairs,
+    transform_points,
+)
+from saga_fg.types import MAX_POSITION, MAX_SPEED, speed_deviation
 
 
 class Kinematics(NamedTuple):

@@ -16,8 +16,6 @@ sensor that has detected the object before and misses it now adds nothing: inter
 existence.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,9 +23,9 @@ from typing import Self
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray
 from saga_fg.tracking.track_filters import BoxFilter, Stationarity, TurnRate
-from saga_fg.types.boxes import Boxes
+from saga_fg.types import Boxes
 
 PRIOR_LOGIT = math.log(0.3 / 0.7)  # of a detection whose score says nothing
 MANY_SENSORS = 32  # from here on, sensors without a part in any track are forgotten: names come from outside

@@ -22,10 +22,8 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError, SagaError, require_type
 from saga_fg.graph import FactorProvider, ProviderError, SceneFactorGraph, UndeterminedError
-from saga_fg.model.scene_graph import SceneGraph
-from saga_fg.model.sensor import Sensor, checked_sensors, sensor_model
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
-from saga_fg.numerics.assignment import Assignment
+from saga_fg.model import SceneGraph, Sensor, checked_sensors, sensor_model
+from saga_fg.numerics import Assignment, FloatArray, IntArray, StrArray
 from saga_fg.parts import KINDS, in_one_line, new_part
 from saga_fg.tracking.association import associate
 from saga_fg.tracking.by_name import estimator_name
@@ -50,8 +48,7 @@ from saga_fg.tracking.update import (
     update_tracks,
 )
 from saga_fg.tracking.visibility import look
-from saga_fg.types.frame import LATEST, Frame, finite_seconds
-from saga_fg.types.track import PredictedTracks, Tracks, checked_horizons
+from saga_fg.types import LATEST, Frame, PredictedTracks, Tracks, checked_horizons, finite_seconds
 
 log = logging.getLogger(__name__)
 

@@ -21,11 +21,8 @@ import numpy as np
 
 from saga_fg.graph import FactorProvider
 from saga_fg.kernels.components import velocities_along
-from saga_fg.model.interactions import POSITION
-from saga_fg.model.scene_graph import SceneGraph
-from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, StrArray, shallow_copy
-from saga_fg.numerics.assignment import Assignment, CrossCovariances
+from saga_fg.model import POSITION, SceneGraph, Sensor
+from saga_fg.numerics import Assignment, BoolArray, CrossCovariances, FloatArray, IntArray, StrArray, shallow_copy
 from saga_fg.parts import new_part
 from saga_fg.tracking.by_name import new_estimator
 from saga_fg.tracking.class_belief import ConfusedClasses
@@ -43,10 +40,7 @@ from saga_fg.tracking.settings import AssociationCost, ClassSettings, TrackerSet
 from saga_fg.tracking.track_filters import Kinematics
 from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.traffic import Traffic, speed_prior
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.by_class import class_values
-from saga_fg.types.frame import Frame
-from saga_fg.types.road_map import MAP_CLASSES
+from saga_fg.types import MAP_CLASSES, Boxes, Frame, class_values
 
 log = logging.getLogger(__name__)
 

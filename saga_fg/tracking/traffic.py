@@ -45,12 +45,12 @@ from saga_fg.errors import InputError
 from saga_fg.kernels.components import speeds_ahead
 from saga_fg.kernels.paths import points_by_cell, trail_paths
 from saga_fg.kernels.tracks import prior_of_traffic
-from saga_fg.model.interactions import Paths
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, StrArray, common_numbers, shallow_copy
+from saga_fg.model import Paths
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, common_numbers, shallow_copy
 from saga_fg.settings import NonNegative, PositiveOrInf, Settings, setting, settings_group
 from saga_fg.tracking.given_identities import exchanged
 from saga_fg.tracking.track_filters import Kinematics
-from saga_fg.types.road_map import Lane
+from saga_fg.types import Lane
 
 SPACING = 2.0  # m between the passages of a track
 FIRST_LANE = -2  # ids of lanes count down from here, so that they are never those of tracks

@@ -20,14 +20,11 @@ A surer track is one of at least its existence that is not unresolved itself. Bo
 nothing, and where the positions of a sensor are uncertain by most of the box's width, overlap tells nothing.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.numerics.assignment import Matching
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, Matching
 from saga_fg.tracking.tracker_state import TrackerState
-from saga_fg.types.boxes import Boxes, paired_bev_iou, touching_pairs
+from saga_fg.types import Boxes, paired_bev_iou, touching_pairs
 
 OVERLAP = 0.05  # bird's-eye IoU above which a new track is unresolved
 MAX_OVERLAP = 0.2  # largest one of two objects

@@ -24,8 +24,6 @@ Source: Musicki, Evans, Stankovic, Integrated Probabilistic Data Association, IE
 39(6), 1994.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -33,11 +31,8 @@ import numpy as np
 
 from factors import RangeRate
 from saga_fg.kernels.components import existences
-from saga_fg.model.discretisation import own_motion
-from saga_fg.model.interactions import POSITION, VELOCITY
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
-from saga_fg.numerics.assignment import Matching
-from saga_fg.numerics.geometry import chi_square_quantile
+from saga_fg.model import POSITION, VELOCITY, own_motion
+from saga_fg.numerics import FloatArray, IntArray, Matching, StrArray, chi_square_quantile
 from saga_fg.tracking.joint_state import moved_to_present
 from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
 from saga_fg.tracking.track_filters import MOVING, Kinematics

@@ -34,15 +34,12 @@ high at range r, on level ground. The share of the object's height above the hig
 ray; the mean over the rays is the visible share.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
-from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, wrap_angle
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.tracker_state import TrackerState
-from saga_fg.types.boxes import Boxes
+from saga_fg.types import Boxes
 
 HIDING = 0.25  # share of covered objects that are hidden; detected are 0.73 to 0.84 of the cars that are detected
 # in plain view, 0.5 to 0.85 of the pedestrians (two detectors on nuScenes, KITTI)

@@ -21,8 +21,6 @@ Cost: circumscribed circles that do not meet are sorted out first, so the work g
 Source: Liang and Barsky, A New Concept and Method for Line Clipping, ACM Transactions on Graphics 3(1), 1984.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
@@ -32,8 +30,17 @@ from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
 from saga_fg.kernels.pairs import paired_overlaps
-from saga_fg.numerics.arrays import Columns, FloatArray, IntArray, StrArray, checked, checked_labels
-from saga_fg.numerics.geometry import near_pairs, transform_points, wrap_angle
+from saga_fg.numerics import (
+    Columns,
+    FloatArray,
+    IntArray,
+    StrArray,
+    checked,
+    checked_labels,
+    near_pairs,
+    transform_points,
+    wrap_angle,
+)
 
 MAX_POSITION = 1e9  # m; beyond, distances have no digits left
 MAX_SPEED = 1e6  # m/s

@@ -1,14 +1,12 @@
 """Settings by class of object: a class has its own, the entry named default serves all others."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from operator import attrgetter
 from typing import Any, TypeVar
 
 import numpy as np
 
-from saga_fg.numerics.arrays import FloatArray, StrArray, distinct
+from saga_fg.numerics import FloatArray, StrArray, distinct
 
 VEHICLES = ("car", "truck", "bus", "trailer", "motorcycle", "bicycle")  # classes of road users with wheels
 DEFAULT = "default"  # key of the settings for every class that has none of its own

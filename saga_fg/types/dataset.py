@@ -15,8 +15,7 @@ from typing import Literal, Protocol, Self
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, StrArray, checked, checked_labels
-from saga_fg.numerics.geometry import checked_transform
+from saga_fg.numerics import BoolArray, FloatArray, StrArray, checked, checked_labels, checked_transform
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Frame
 

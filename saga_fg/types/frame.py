@@ -21,16 +21,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError, require_type
-from saga_fg.numerics.arrays import (
+from saga_fg.numerics import (
     Columns,
     FloatArray,
     IntArray,
     checked,
     checked_covariances,
+    checked_transform,
     from_upper_triangle,
     upper_triangle,
 )
-from saga_fg.numerics.geometry import checked_transform
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
 from saga_fg.types.road_map import RoadMap
 from saga_fg.types.track import html_table, text_table

@@ -36,8 +36,7 @@ import numpy as np
 import scipy.linalg
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import Feet, Polylines
+from saga_fg.numerics import Feet, FloatArray, IntArray, Polylines
 from saga_fg.settings import Positive, Settings, required_setting, setting
 
 Point = tuple[float, float]

@@ -1,7 +1,5 @@
 """Tracker output: `Tracks` of one moment, `PredictedTracks` at future times, and both as tables to show."""
 
-from __future__ import annotations
-
 import html
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError, MissingExtraError
-from saga_fg.numerics.arrays import (
+from saga_fg.numerics import (
     BoolArray,
     Columns,
     FloatArray,

@@ -32,8 +32,6 @@ boxes at half of the annotated times or more, the others are frames without dete
 Source: https://argoverse.github.io/user-guide/tasks/3d_object_detection.html, "Submission format".
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -44,15 +42,11 @@ import numpy as np
 from data_tools.datasets.annotated import DetectedScenes
 from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.source import AreaMap, Kind, map_points
-from data_tools.files.file_access import read_bytes
-from data_tools.files.readers import WHOLE, arrow_arrays, parsed_json
+from data_tools.files import WHOLE, arrow_arrays, parsed_json, read_bytes
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, checked
-from saga_fg.numerics.geometry import checked_quaternions, quaternion_rotation, yaw_of
-from saga_fg.tables.detections import DetectionTable
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations, Scene
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.numerics import FloatArray, IntArray, StrArray, checked, checked_quaternions, quaternion_rotation, yaw_of
+from saga_fg.tables import DetectionTable
+from saga_fg.types import Annotations, Boxes, Detections, Frame, Scene
 
 CLASSES = {
     "REGULAR_VEHICLE": "car",

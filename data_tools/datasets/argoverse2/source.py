@@ -14,8 +14,6 @@ files are read: to read a .pkl is to run what is in it.
 Source: https://github.com/argoverse/av2-api, src/av2/evaluation/tracking/SUBMISSION_FORMAT.md and eval.py.
 """
 
-from __future__ import annotations
-
 import pickle
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -44,19 +42,18 @@ from data_tools.datasets.argoverse2.logs import (
 from data_tools.datasets.detection_files import TrackRows, read_detections
 from data_tools.datasets.results import Results, scene_result
 from data_tools.datasets.source import ChosenScenes, ResultFormat, Surroundings, TrackedScenes, option
-from data_tools.files.file_access import atomic_file, is_url, local_copy, local_tree
-from data_tools.files.readers import arrow_arrays
+from data_tools.files import arrow_arrays, atomic_file, is_url, local_copy, local_tree
 from saga_fg.errors import InputError, error_context
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
-from saga_fg.numerics.geometry import (
+from saga_fg.numerics import (
+    FloatArray,
+    IntArray,
+    StrArray,
     inverse_transform,
     quaternion_rotation,
     rotation_quaternion,
     yaw_quaternion,
 )
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.track import Tracks, known_velocities
+from saga_fg.types import Boxes, Dataset, Scene, Tracks, known_velocities
 
 SCORED = (
     *("ARTICULATED_BUS", "BICYCLE", "BICYCLIST", "BOLLARD", "BOX_TRUCK", "BUS", "CONSTRUCTION_BARREL"),

@@ -73,8 +73,7 @@ from data_tools.datasets.detection_files.tracks import (
     write_rows,
     write_tracks,
 )
-from saga_fg.tables.column_names import TableImport
-from saga_fg.tables.columns import LABEL_COLUMNS, TRACK_COLUMNS
+from saga_fg.tables import LABEL_COLUMNS, TRACK_COLUMNS, TableImport
 
 __all__ = [
     "LABEL_COLUMNS",

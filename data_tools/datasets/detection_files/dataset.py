@@ -3,8 +3,6 @@
 A first look at a table: how its columns, times and classes are understood, and what is doubtful.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,9 +11,8 @@ import numpy as np
 
 from data_tools.datasets.detection_files.formats import ROWS, Layout, read_raw_parts, read_raw_table
 from saga_fg.errors import InputError, unknown_name
-from saga_fg.numerics.arrays import BoolArray, FloatArray
-from saga_fg.tables.column_names import TableImport
-from saga_fg.tables.columns import (
+from saga_fg.numerics import BoolArray, FloatArray
+from saga_fg.tables import (
     BOX,
     COLUMNS,
     POSE,
@@ -24,11 +21,13 @@ from saga_fg.tables.columns import (
     ROTATIONS,
     SETTLED,
     TRACK_COLUMNS,
+    DetectionTable,
     RawTable,
+    TableImport,
+    seems_dense_traffic,
+    sorted_by_time,
 )
-from saga_fg.tables.detections import DetectionTable, sorted_by_time
-from saga_fg.tables.plausibility import seems_dense_traffic
-from saga_fg.types.dataset import Finding, Scene
+from saga_fg.types import Finding, Scene
 
 
 def read_detections(path: str | Path, how: TableImport | None = None) -> DetectionTable:

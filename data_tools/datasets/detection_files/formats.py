@@ -1,7 +1,5 @@
 """The formats of tables of boxes: CSV, newline-delimited JSON, NumPy archives, Parquet and Feather."""
 
-from __future__ import annotations
-
 import csv
 import logging
 import shlex
@@ -14,12 +12,24 @@ from typing import Any, TextIO, TypeVar
 
 import numpy as np
 
-from data_tools.files.file_access import open_bytes, open_text
-from data_tools.files.readers import SUFFIXES, arrow_columns, arrow_names, load_archive, parsed_json
+from data_tools.files import SUFFIXES, arrow_columns, arrow_names, load_archive, open_bytes, open_text, parsed_json
 from saga_fg.errors import InputError
-from saga_fg.tables.column_names import Clock, Columns, TableImport, meaning, understood
-from saga_fg.tables.columns import COLUMNS, NAMED, POSE, REQUIRED, RawTable, Values, as_names, clock_of
-from saga_fg.tables.detections import sorted_by_time
+from saga_fg.tables import (
+    COLUMNS,
+    NAMED,
+    POSE,
+    REQUIRED,
+    Clock,
+    Columns,
+    RawTable,
+    TableImport,
+    Values,
+    as_names,
+    clock_of,
+    meaning,
+    sorted_by_time,
+    understood,
+)
 
 log = logging.getLogger(__name__)
 

@@ -39,19 +39,18 @@ import numpy as np
 
 from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.detection_files.formats import Layout, read_raw_table
-from data_tools.files.file_access import atomic_file, open_bytes
+from data_tools.files import atomic_file, open_bytes
 from saga_fg.errors import InputError, MissingExtraError, error_context, unknown_name
-from saga_fg.numerics.arrays import (
+from saga_fg.numerics import (
     BoolArray,
     Columns,
     FloatArray,
     StrArray,
     from_upper_triangle,
     upper_triangle,
+    yaw_transform,
 )
-from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.tables.column_names import TableImport
-from saga_fg.tables.columns import (
+from saga_fg.tables import (
     LABEL_COLUMNS,
     POSE,
     PROBABILITIES,
@@ -61,12 +60,12 @@ from saga_fg.tables.columns import (
     SETTLED,
     TRACK_COLUMNS,
     RawTable,
+    Sample,
+    TableImport,
+    box_columns,
+    findings_of,
 )
-from saga_fg.tables.conventions import Sample, findings_of
-from saga_fg.tables.detections import box_columns
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations, Finding, Scene, refuse_contradictions
-from saga_fg.types.track import PredictedTracks, Tracks
+from saga_fg.types import Annotations, Boxes, Finding, PredictedTracks, Scene, Tracks, refuse_contradictions
 
 if TYPE_CHECKING:
     from saga_fg.smoothing import Labels, Review

@@ -39,8 +39,6 @@ vehicle's motion. A copy of the dataset does not say whether its scans are. Sour
 Geiger et al., Vision meets robotics: the KITTI dataset, IJRR 2013; KISS-ICP, which takes azimuths for times as well.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -57,17 +55,12 @@ from data_tools.datasets.kitti.labels import (
     read_kitti_labels,
 )
 from data_tools.datasets.source import Images
-from data_tools.files.file_access import local_tree
-from data_tools.files.readers import TextTable, read_lines, read_table
+from data_tools.files import TextTable, local_tree, read_lines, read_table
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
-from data_tools.lidar import Scan, azimuth_times
-from data_tools.lidar.recording import ScanRecording
-from data_tools.lidar.scan_files import KITTI, read_records
+from data_tools.lidar import KITTI, Scan, ScanRecording, azimuth_times, read_records
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import inverse_transform, is_rotation
-from saga_fg.types.dataset import Annotations, Scene
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.numerics import FloatArray, inverse_transform, is_rotation
+from saga_fg.types import Annotations, Detections, Frame, Scene
 
 _KEYS: dict[str, tuple[tuple[int, int], tuple[str, ...]]] = {
     "P2": ((3, 4), ("P2",)),

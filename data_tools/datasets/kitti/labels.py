@@ -22,19 +22,16 @@ The 2D box encloses the projection of the twelve edges, cut at a plane just befo
 image. The observation angle is alpha = rotation_y - atan2(x, z). Pixels count from 0.
 """
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from data_tools.files.readers import TextTable, read_table
+from data_tools.files import TextTable, read_table
 from data_tools.kitti_objects import CameraBoxes, KittiObjects, has_box
 from saga_fg.errors import InputError, unknown_name
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray
-from saga_fg.numerics.geometry import wrap_angle
+from saga_fg.numerics import FloatArray, IntArray, StrArray, wrap_angle
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
 

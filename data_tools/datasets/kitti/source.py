@@ -65,7 +65,7 @@ from data_tools.datasets.source import (
 )
 from data_tools.evaluation import Evaluation, HotaRow, mean_scores, placed_detections
 from data_tools.figures import FigureTable, cell
-from data_tools.files.file_access import atomic_directory, is_url
+from data_tools.files import atomic_directory, is_url
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box, world_boxes_to_camera
 from data_tools.metrics import (
     KittiSimilarity,
@@ -79,10 +79,8 @@ from data_tools.metrics import (
     label_velocities,
 )
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.geometry import inverse_transform
-from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.track import Tracks, known_velocities
+from saga_fg.numerics import FloatArray, IntArray, inverse_transform
+from saga_fg.types import Dataset, Scene, Tracks, known_velocities
 
 if TYPE_CHECKING:
     from saga_fg.smoothing import Labels

@@ -4,8 +4,6 @@ Objects are brought from the frame of their message to the vehicle's by the tran
 moments of the scene are these times. The tokens of the moments are the times in ns, as the messages have them.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,11 +26,10 @@ from data_tools.datasets.mcap.transforms import (
     find_places,
     transform_records,
 )
-from data_tools.files.isolated_reading import isolated
+from data_tools.files import isolated
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics.arrays import IntArray
-from saga_fg.types.dataset import Scene
-from saga_fg.types.frame import Frame
+from saga_fg.numerics import IntArray
+from saga_fg.types import Frame, Scene
 
 log = logging.getLogger(__name__)
 

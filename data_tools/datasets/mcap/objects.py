@@ -18,8 +18,6 @@ all objects of its time. Results are `foxglove.SceneUpdate` in protobuf, with th
 https://docs.foxglove.dev/docs/sdk/schemas/scene-update.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -29,11 +27,17 @@ from numpy.typing import NDArray
 
 from data_tools.datasets.mcap.ros2_types import Columns, Message, frame_name, header, nanoseconds, wxyz, xyz
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray, StrArray, upper_triangle
-from saga_fg.numerics.geometry import quaternion_norms, quaternion_rotation, yaw_of, yaw_quaternion
-from saga_fg.types.boxes import MAX_POSITION, MAX_SIZE, MAX_SPEED, Boxes
-from saga_fg.types.frame import Detections
-from saga_fg.types.track import Tracks
+from saga_fg.numerics import (
+    FloatArray,
+    IntArray,
+    StrArray,
+    quaternion_norms,
+    quaternion_rotation,
+    upper_triangle,
+    yaw_of,
+    yaw_quaternion,
+)
+from saga_fg.types import MAX_POSITION, MAX_SIZE, MAX_SPEED, Boxes, Detections, Tracks
 
 NAN = float("nan")
 NO_COVARIANCE = (NAN,) * 36

@@ -6,8 +6,6 @@ one of `ros2_types`; those in protobuf by the recording's descriptors. Decoders 
 Sources: https://mcap.dev/spec; the storage plugins of https://github.com/ros2/rosbag2.
 """
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -18,8 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from data_tools.datasets.mcap.ros2_types import definition, plain_type
-from data_tools.files.file_access import open_bytes
-from data_tools.files.isolated_reading import isolated, one_line
+from data_tools.files import isolated, one_line, open_bytes
 from saga_fg.errors import InputError, MissingExtraError, unknown_name
 
 SUFFIXES = (".mcap", ".db3")

@@ -12,8 +12,6 @@ Sources: the packages std_msgs, geometry_msgs, nav_msgs, sensor_msgs, visualizat
 OMG, DDS Interoperability Wire Protocol 2.5, section 10.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -24,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import IntArray
+from saga_fg.numerics import IntArray
 
 Message = dict[str, Any]
 

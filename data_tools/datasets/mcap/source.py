@@ -5,8 +5,6 @@ Tracks as messages of a file of MCAP, in the type that the detections had, and r
 The topic is `/saga_fg/tracks`, the frame the one that was tracked in, the times are those of the detections.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -35,12 +33,10 @@ from data_tools.datasets.source import (
     file_digest,
     option,
 )
-from data_tools.files.file_access import atomic_file, local_copy
+from data_tools.files import atomic_file, local_copy
 from saga_fg.errors import InputError, error_context
-from saga_fg.tables.column_names import pairs
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Dataset, Scene
-from saga_fg.types.track import Tracks
+from saga_fg.tables import pairs
+from saga_fg.types import Boxes, Dataset, Scene, Tracks
 
 TOPIC = "/saga_fg/tracks"
 

@@ -8,8 +8,6 @@ Translations are interpolated linearly, rotations by normalised linear interpola
 their ends for `HOLD`, and over gaps of `LONGEST_GAP`; farther away they are unknown.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -22,8 +20,15 @@ import numpy as np
 from data_tools.datasets.mcap.recording import LoggedMessage
 from data_tools.datasets.mcap.ros2_types import checked_time, frame_name, nanoseconds, wxyz, xyz
 from saga_fg.errors import InputError, unknown_name
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
-from saga_fg.numerics.geometry import checked_quaternions, inverse_transform, quaternion_rotation
+from saga_fg.numerics import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    checked,
+    checked_quaternions,
+    inverse_transform,
+    quaternion_rotation,
+)
 
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "foxglove.FrameTransforms", "foxglove.FrameTransform")
 ODOMETRY_TYPES = ("nav_msgs/Odometry",)

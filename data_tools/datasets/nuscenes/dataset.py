@@ -18,8 +18,6 @@ The vector maps of nuScenes, where the map expansion lies below the dataroot: ma
 Format: https://github.com/nutonomy/nuscenes-devkit/blob/master/docs/schema_nuscenes.md and its map API.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path, PurePosixPath
@@ -39,14 +37,11 @@ from data_tools.datasets.nuscenes.tables import (
     table_folder,
 )
 from data_tools.datasets.source import AreaMap, Images, Kind, map_points
-from data_tools.files.file_access import read_bytes
-from data_tools.files.readers import parsed_json
-from data_tools.lidar.recording import ScanRecording
-from data_tools.lidar.scan_files import NUSCENES, read_records
+from data_tools.files import parsed_json, read_bytes
+from data_tools.lidar import NUSCENES, ScanRecording, read_records
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.types.dataset import Annotations, Scene
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.numerics import FloatArray
+from saga_fg.types import Annotations, Detections, Frame, Scene
 
 log = logging.getLogger(__name__)
 

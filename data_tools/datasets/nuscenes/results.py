@@ -37,14 +37,19 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from data_tools.datasets.nuscenes.tables import DETECTION_CLASSES, TRACKING_CLASSES
-from data_tools.files.file_access import atomic_file
-from data_tools.files.readers import JsonStream, open_json
+from data_tools.files import JsonStream, atomic_file, open_json
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics.arrays import Columns, FloatArray, StrArray, from_upper_triangle, upper_triangle
-from saga_fg.numerics.geometry import quaternion_norms, quaternion_yaw, yaw_quaternion
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Scene
-from saga_fg.types.track import Tracks, known_velocities
+from saga_fg.numerics import (
+    Columns,
+    FloatArray,
+    StrArray,
+    from_upper_triangle,
+    quaternion_norms,
+    quaternion_yaw,
+    upper_triangle,
+    yaw_quaternion,
+)
+from saga_fg.types import Boxes, Scene, Tracks, known_velocities
 
 Task = Literal["detection", "tracking"]
 _UNKNOWN = (np.nan, np.nan)

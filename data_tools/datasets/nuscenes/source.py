@@ -1,7 +1,5 @@
 """nuScenes as a dataset of the command; its tracking results beside the ground truth of their scenes, and figures."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -43,7 +41,7 @@ from data_tools.evaluation import (
     placed_detections,
     sweep_table,
 )
-from data_tools.files.file_access import is_url, local_copy, local_tree
+from data_tools.files import is_url, local_copy, local_tree
 from data_tools.metrics import (
     LabelErrors,
     NuScenesTrackingMetrics,
@@ -55,9 +53,8 @@ from data_tools.metrics import (
     nuscenes_tracking_metrics,
 )
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations, Dataset, Scene
+from saga_fg.numerics import FloatArray
+from saga_fg.types import Annotations, Boxes, Dataset, Scene
 
 
 @dataclass(frozen=True, eq=False)

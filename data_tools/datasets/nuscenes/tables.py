@@ -35,18 +35,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from data_tools.datasets.central_differences import central_differences
-from data_tools.files.readers import JsonStream, open_json
+from data_tools.files import JsonStream, open_json
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import (
+from saga_fg.numerics import (
+    FloatArray,
     checked_quaternions,
     checked_transform,
     quaternion_rotation,
     quaternion_yaw,
     yaw_quaternion,
 )
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Annotations
+from saga_fg.types import Annotations, Boxes
 
 _TEXT_FIELDS = ("name", "channel", "next")  # and all that end in "token"
 

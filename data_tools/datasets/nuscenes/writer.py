@@ -55,13 +55,10 @@ from data_tools.datasets.nuscenes.tables import (
     table_folder,
     token,
 )
-from data_tools.files.file_access import atomic_directory, atomic_file, open_bytes, write_text
-from data_tools.files.readers import open_json, parsed_json
+from data_tools.files import atomic_directory, atomic_file, open_bytes, open_json, parsed_json, write_text
 from saga_fg.errors import InputError, error_context
-from saga_fg.numerics.arrays import FloatArray, IntArray, upper_triangle
-from saga_fg.numerics.geometry import yaw_of, yaw_quaternion
-from saga_fg.types.dataset import Annotations, Dataset, Scene
-from saga_fg.types.frame import Frame
+from saga_fg.numerics import FloatArray, IntArray, upper_triangle, yaw_of, yaw_quaternion
+from saga_fg.types import Annotations, Dataset, Frame, Scene
 
 if TYPE_CHECKING:
     from saga_fg.smoothing import Labels

@@ -29,10 +29,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
-from saga_fg.numerics.geometry import transform_points
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, transform_points
 from saga_fg.slam.joint.record import JointSettings, RecordedEpoch, motion_covariances
-from saga_fg.types.by_class import class_numbers
+from saga_fg.types import class_numbers
 
 _CREEPING = 0.3  # speed of creeping traffic, as a share of the usual one
 _ALIKE = 10.0  # s, time over which traffic keeps its shares

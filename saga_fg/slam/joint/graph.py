@@ -19,8 +19,6 @@ along the path so far, starting with the odometry's, takes the probabilities of 
 solves the graph of all epochs. Passes end when associations repeat.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -44,12 +42,13 @@ from factors import (
     relative_factors,
 )
 from saga_fg.errors import InputError
-from saga_fg.estimators.batch import GraphSolution
+from saga_fg.estimators import GraphSolution
 from saga_fg.graph import (
     EGO_ERROR,
     EGO_POSE,
     OBJECT,
     Additions,
+    Factor,
     FactorProvider,
     GraphView,
     NewVariable,
@@ -57,12 +56,8 @@ from saga_fg.graph import (
     ask_all,
     key_of,
 )
-from saga_fg.graph.factor_checks import Factor
-from saga_fg.model.interactions import POSITION, VELOCITY
-from saga_fg.model.motion import NodeType
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.assignment import Assignment
-from saga_fg.numerics.geometry import transform_points
+from saga_fg.model import POSITION, VELOCITY, NodeType
+from saga_fg.numerics import Assignment, FloatArray, IntArray, transform_points
 from saga_fg.slam.joint.association import SlowErrors, stationary_probabilities
 from saga_fg.slam.joint.record import (
     MAX_ITERATIONS,
@@ -75,7 +70,7 @@ from saga_fg.slam.joint.record import (
 )
 from saga_fg.slam.mapping import pose_key
 from saga_fg.tracking import Tracker
-from saga_fg.types.frame import Frame
+from saga_fg.types import Frame
 
 _START_NOISE = 1e-3  # standard deviation of the first pose, m and rad
 _LIKELY = 0.9  # stationary with less than this probability: no such factor, since creeping queues are in doubt, too

@@ -28,11 +28,8 @@ from numpy.typing import ArrayLike
 
 from factors import ERROR_DIM
 from saga_fg.errors import InputError
-from saga_fg.model.discretisation import Transition, discretise
-from saga_fg.model.motion import NodeType
-from saga_fg.model.sensor import Sensor
-from saga_fg.numerics.arrays import FloatArray, IntArray, checked, checked_covariances
-from saga_fg.numerics.geometry import checked_transform, inverse_transform
+from saga_fg.model import NodeType, Sensor, Transition, discretise
+from saga_fg.numerics import FloatArray, IntArray, checked, checked_covariances, checked_transform, inverse_transform
 from saga_fg.settings import (
     Positive,
     PositiveInt,
@@ -41,11 +38,8 @@ from saga_fg.settings import (
     setting,
     settings_group,
 )
-from saga_fg.tracking import Tracker
-from saga_fg.tracking.map_nodes import motion_of
-from saga_fg.tracking.measurements import frame_measurements
-from saga_fg.types.by_class import DEFAULT
-from saga_fg.types.frame import Detections, Frame
+from saga_fg.tracking import Tracker, frame_measurements, motion_of
+from saga_fg.types import DEFAULT, Detections, Frame
 
 
 @dataclass(frozen=True)

@@ -42,9 +42,8 @@ import numpy as np
 from factors import ResidualFactors, Variable, Vector, pose
 from factors.manifolds import central_differences
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray
-from saga_fg.numerics.assignment import assign, gate
-from saga_fg.types.frame import LandmarkType, Observation
+from saga_fg.numerics import FloatArray, IntArray, assign, gate
+from saga_fg.types import LandmarkType, Observation
 
 _OPEN = 1e-9  # smallest singular value over the largest one of what determines a landmark
 

@@ -1,7 +1,5 @@
 """Poses and landmarks in a running graph: their keys, and providers of motions and of associated observations."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,11 +15,10 @@ from factors import (
     pose,
     pose_prior_factor,
 )
-from saga_fg.estimators.batch import GraphSolution
-from saga_fg.graph import EGO_POSE, LANDMARK, Additions, GraphView, NewVariable, key_of
-from saga_fg.graph.factor_checks import Factor
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.types.frame import Landmark, LandmarkType, Observation
+from saga_fg.estimators import GraphSolution
+from saga_fg.graph import EGO_POSE, LANDMARK, Additions, Factor, GraphView, NewVariable, key_of
+from saga_fg.numerics import FloatArray
+from saga_fg.types import Landmark, LandmarkType, Observation
 
 
 def pose_key(epoch: int) -> int:

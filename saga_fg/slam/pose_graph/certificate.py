@@ -42,7 +42,7 @@ import numpy as np
 from scipy.sparse import block_diag, csc_array, diags_array
 from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh
 
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics import FloatArray
 from saga_fg.slam.pose_graph.chordal import ChordalCost, factorised, nearest_rotations
 from saga_fg.slam.pose_graph.graph import PoseGraph
 

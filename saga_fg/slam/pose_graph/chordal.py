@@ -41,8 +41,6 @@ Source: L. Carlone, R. Tron, K. Daniilidis, F. Dellaert, "Initialization techniq
 estimation and its use in pose graph optimization", ICRA 2015. Both systems are sparse and solved directly.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -52,7 +50,7 @@ from scipy.sparse import block_diag, bsr_array, csc_array, csr_array, diags_arra
 from scipy.sparse.linalg import SuperLU, splu
 
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.slam.pose_graph.graph import PoseGraph
 
 _FASTER = 15.0  # operations of a factorisation in the time of one of a product, from grids to loops

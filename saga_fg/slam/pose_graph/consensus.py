@@ -37,7 +37,7 @@ from scipy.stats import chi2
 
 from factors import ResidualFactors, linearised, solve
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray
+from saga_fg.numerics import BoolArray, FloatArray, IntArray
 from saga_fg.slam.pose_graph.chordal import factorised
 from saga_fg.slam.pose_graph.graph import PoseGraph, trusted
 from saga_fg.slam.pose_graph.optimisation import (

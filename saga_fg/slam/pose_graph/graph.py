@@ -23,7 +23,7 @@ import numpy as np
 
 from factors import ResidualFactors, relative_factors
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import (
+from saga_fg.numerics import (
     BoolArray,
     FloatArray,
     IntArray,

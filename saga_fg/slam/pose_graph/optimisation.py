@@ -8,8 +8,6 @@ only where their own error is lower than what it led to: from far off, solvers t
 pose is fixed, unless priors say where poses are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -28,7 +26,7 @@ from factors import (
     solve,
 )
 from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.slam.pose_graph.certificate import ChordalMinimum, chordal_minimum
 from saga_fg.slam.pose_graph.chordal import chordal_poses
 from saga_fg.slam.pose_graph.graph import PoseGraph, trusted

@@ -15,8 +15,6 @@ Variables of the newest epoch that go on (velocity, bias) keep their own margina
 before is left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,10 +23,8 @@ import gtsam
 import numpy as np
 
 from factors import Variable, between_factor, residual_factor
-from saga_fg.graph.factor_checks import Factor, stacked
-from saga_fg.graph.factor_groups import PriorGroup
-from saga_fg.graph.variables import LinearisationPoint
-from saga_fg.numerics.arrays import FloatArray
+from saga_fg.graph import Factor, LinearisationPoint, PriorGroup, stacked
+from saga_fg.numerics import FloatArray
 
 _NOTHING = 1e-3  # root of the information that counts as none: a deviation of 1000 m or rad
 

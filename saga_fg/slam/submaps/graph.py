@@ -32,12 +32,9 @@ import numpy as np
 
 from factors import Robust, SolverSettings
 from saga_fg.errors import InputError
-from saga_fg.estimators.batch import BatchSolver, GraphSolution
-from saga_fg.estimators.incremental_smoother import IncrementalSmoother
-from saga_fg.estimators.isam2_engine import RelinearisationSettings
+from saga_fg.estimators import BatchSolver, GraphSolution, IncrementalSmoother, RelinearisationSettings
 from saga_fg.graph import Additions, FactorProvider, GraphView, SceneFactorGraph, ask_all
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import inverse_transform
+from saga_fg.numerics import FloatArray, inverse_transform
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.mapping import (
     AssociatedObservation,
@@ -51,7 +48,7 @@ from saga_fg.slam.mapping import (
 )
 from saga_fg.slam.submaps.condensing import CondensedSubmap
 from saga_fg.slam.submaps.loops import LoopClosure, Loops, LoopSelection, Motion, loop_factors, select_loops
-from saga_fg.types.frame import Frame, Landmark, Observation
+from saga_fg.types import Frame, Landmark, Observation
 
 _GAP = 3.0  # m
 _ANCHOR = 1e-12 * np.eye(6)  # covariance of the anchor in its own frame

@@ -17,8 +17,6 @@ With odometry inflated by some s, the loops that agree are those of `saga_fg.sla
 that some s leads to gets the s that fits it; the cheapest is taken. So a loop alone stays, and several that agree.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -33,8 +31,15 @@ from scipy.sparse import coo_array
 from factors import Robust, Solution, between_factor, solve
 from saga_fg.errors import InputError
 from saga_fg.graph import Additions, GraphView
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
-from saga_fg.numerics.geometry import carried_covariance, checked_transform, inverse_transform
+from saga_fg.numerics import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    carried_covariance,
+    checked,
+    checked_transform,
+    inverse_transform,
+)
 from saga_fg.slam.mapping import pose_key
 from saga_fg.slam.pose_graph import PoseGraph, PosePriors, consensus, factor_graph
 from saga_fg.slam.pose_graph.chordal import factorised
