@@ -454,9 +454,11 @@ def evaluate_tracks(
     with_hota: bool = False,
     innovations: Mapping[str, FloatArray] | None = None,
     sweep: bool = False,
+    detected: bool = False,
 ) -> Evaluation:
     """Score the tracks found in some scenes, class by class, pooled over the scenes.
 
+    detected     errors are those at the true objects that a detection matches, beside the detections' own
     sweep        over scores, too (AMOTA); HOTA is then of the tracks from the score of the best MOTA on, else of all
     innovations  squared distances of the run by class, to be among the figures
 
@@ -470,7 +472,9 @@ def evaluate_tracks(
         for label, metrics in scene_metrics_by_label(scene.ground_truth, found.by_frame(len(scene))).items():
             by_label.setdefault(label, []).append(metrics)
         visible = SceneBoxes.of_annotations(scene.ground_truth, hidden=False)
-        errors.append(label_errors(visible, found, visible.boxes.velocity))
+        errors.append(
+            label_errors(visible, found, visible.boxes.velocity, placed_detections(scene) if detected else None)
+        )
         pairs.append((SceneBoxes.of_annotations(scene.ground_truth), found))
     pooled = {label: SceneMetrics.pool(parts) for label, parts in sorted(by_label.items())}
     swept = score_sweep(results) if sweep else None

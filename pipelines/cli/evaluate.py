@@ -1,6 +1,6 @@
 """`saga-fg evaluate` and `saga-fg benchmark`: how good are tracks and labels?"""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -107,19 +107,21 @@ def _evaluate_labels(
     json_file: JsonFile = None,
     verbose: options.Verbose = False,
 ) -> None:
-    """Judge labels beside the online tracks and the detections: recall, errors on the same boxes, calibration.
+    """Judge labels beside the online tracks: MOTA, AMOTA, errors where something is detected, calibration.
 
     The scenes are those in the table. Where nobody has labelled, the columns p_exists, p_class, p_identity and
     p_heading of the labels, and review.csv, say how sure they are.
     """
     _require_truth(source)
     table = _table(result)
-    scenes = np.unique(read_tracks(table, labels=True).scene).tolist()
+    rows = read_tracks(table, labels=True)
+    scenes = np.unique(rows.scene).tolist()
     settings = load_smooth_config(source.family, config)
     chosen = source.restricted(scenes) if scenes else source
     with chosen.open(truth=True) as dataset, progress_bar(len(scenes)) as progress:
-        evaluation = evaluate_labels(table, dataset, settings, method, progress)
-    report(evaluation.tables(), evaluation.figures(), json_file)
+        found = evaluate_labels(rows, table, dataset, settings, method, progress)
+    tables = [replace(table, title=f"{name}: {table.title}") for name, each in found.items() for table in each.tables()]
+    report(tables, {name: each.figures() for name, each in found.items()}, json_file)
 
 
 evaluate_app = dataset_commands(
@@ -136,7 +138,7 @@ evaluate_app = dataset_commands(
 )
 labels_app = dataset_commands(
     "evaluate labels",
-    "Judge labels that `saga-fg smooth` made, beside the online tracks and the detections.",
+    "Judge labels that `saga-fg smooth` made, beside the online tracks.",
     _evaluate_labels,
     ("evaluate labels {result}",),
     listed=lambda source: source.has_truth or bool(source.truth_option),

@@ -13,7 +13,6 @@ from data_tools.datasets.kitti import KittiTracking
 from data_tools.datasets.nuscenes import NuScenes, write_nuscenes
 from data_tools.evaluation import placed_detections
 from data_tools.metrics import ErrorSample, LabelErrors, SceneBoxes, error_summary, label_errors, match_scene
-from data_tools.metrics.labels import CommonBoxes, LabelledScene, common_boxes
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.config import Family
 from pipelines.configuration import read_settings, write_settings
@@ -93,7 +92,7 @@ def test_labels_are_judged_beside_online_tracks_and_detections(tmp_path):
     )
     arguments = ["evaluate", "labels", "simulated", str(tmp_path / "labels"), "--seed", "9"]
     run = done(*arguments, "--simulator", _short(tmp_path), "--method", "kf")
-    for title in ("Precision and recall", "by class", "by range", "by occlusion", "Calibration"):
+    for title in ("online: Tracks at every moment", "labels: RMSE at labels", "labels: Calibration"):
         assert title in run.output
 
 
@@ -107,7 +106,7 @@ def test_labels_of_a_table_are_judged_by_a_table_of_truth(tmp_path):
     labels = ["evaluate", "labels", "file", tmp_path / "labels", "--detections", table]
     assert "expected ground truth, there is none; name it: --truth TABLE" in refused(*labels)
     done(*labels, "--truth", truth, "--json", figures)
-    assert json.loads(figures.read_text())["precision_recall"]["2.0"]["labels"]["whole"] == [1.0, 1.0]
+    assert json.loads(figures.read_text())["labels"]["tracking"]["overall"]["recall"] == 1.0
     labels[3] = tmp_path / "nothing"
     assert "expected a folder that `saga-fg smooth` wrote" in refused(*labels, "--truth", truth)
 
@@ -208,29 +207,18 @@ def dataset_of(family: str, recordings: Path) -> Dataset:
     return NuScenes(root, "v1.0-mini", found, SCENES[family], ground_truth=True)
 
 
-def compared(scene: Scene, family: str) -> CommonBoxes:
-    """The true boxes that both match within 2 m."""
-    config = load_smooth_config(family)
-    systems = {
-        "online": SceneBoxes.of_tracks(track_scene(scene, config.tracking.new_tracker("saga")).tracks),
-        "labels": SceneBoxes.of_tracks(smooth_scene(scene, config).tracks),
-    }
-    assert scene.ground_truth is not None
-    truth = SceneBoxes.of_annotations(scene.ground_truth)
-    visible = np.concatenate([moment.visible for moment in scene.ground_truth])
-    return common_boxes(LabelledScene(truth, visible, truth.boxes.velocity, np.zeros(len(truth)), systems), gate=2.0)
-
-
 @pytest.mark.parametrize("family", list(SCENES))
 def test_labels_are_nearer_than_online_tracks_in_every_class(recordings, family):
-    dataset = dataset_of(family, recordings)
-    boxes = CommonBoxes.concatenate([compared(dataset.scene(name), family) for name in dataset.scenes])
-    names, count = np.unique(boxes.label, return_counts=True)
+    dataset, config = dataset_of(family, recordings), load_smooth_config(family)
+    pairs = [of_both(dataset.scene(name), config, None) for name in dataset.scenes]
+    online, labels = (LabelErrors.pool(parts) for parts in zip(*pairs, strict=True))
+    both = online.tracked & labels.tracked & labels.matched
+    names, count = np.unique(labels.label[both], return_counts=True)
     classes = names[count >= FEWEST].tolist()
     assert len(classes) >= 3
     for label in classes:
-        of_class = boxes.select(boxes.label == label)
-        assert of_class.sample("labels", "position").rmse < of_class.sample("online", "position").rmse, label
+        of_class = both & (labels.label == label)
+        assert labels.sample("position", of_class).rmse < online.sample("position", of_class).rmse, label
 
 
 # Labels of crowds: never worse than the detections they come from, nor than the online tracks; nobody is lost
@@ -278,18 +266,18 @@ def crowd(seed: int) -> Scene:
     return Scene("crowd", times, poses, tuple(map(str, range(STEPS))), frames, truth)
 
 
-def errors(scene: Scene, tracks: tuple[Tracks, ...], label: str = "pedestrian") -> LabelErrors:
-    """Errors at the labels of a class that a detection matches."""
+def errors(scene: Scene, tracks: tuple[Tracks, ...], label: str | None = "pedestrian") -> LabelErrors:
+    """Errors at the labels of a class, None: of all, that a detection matches."""
     assert scene.ground_truth is not None
     truth = SceneBoxes.of_annotations(scene.ground_truth, hidden=False)
-    truth = truth.select(np.flatnonzero(truth.boxes.label == label))
+    truth = truth.select(np.flatnonzero((truth.boxes.label == label) | (label is None)))
     return label_errors(truth, SceneBoxes.of_tracks(tracks), truth.boxes.velocity, placed_detections(scene))
 
 
-def of_both(scene: Scene, config: SmoothConfig) -> tuple[LabelErrors, LabelErrors]:
+def of_both(scene: Scene, config: SmoothConfig, label: str | None = "pedestrian") -> tuple[LabelErrors, LabelErrors]:
     """Errors of the online tracks and of the labels."""
     online = track_scene(scene, config.tracking.new_tracker("saga")).tracks
-    return errors(scene, tuple(online)), errors(scene, smooth_scene(scene, config).tracks)
+    return errors(scene, tuple(online), label), errors(scene, smooth_scene(scene, config).tracks, label)
 
 
 @pytest.fixture(scope="module")
