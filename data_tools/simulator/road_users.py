@@ -1,4 +1,4 @@
-"""Pedestrians and cyclists of the simulator, and trajectories of N objects.
+"""Pedestrians of the simulator, and trajectories of N objects.
 
 Trajectories of N objects, sampled in time and interpolated between the samples.
 
@@ -13,10 +13,6 @@ during a pause. Each member has a position in the group and sways about it like 
     dw = (target - w) / tau dt,      de = u dt,      du = -(omega^2 e + 2 omega u) dt + sqrt(4 omega^3) sigma dW,
 
 which in equilibrium has standard deviation sigma per axis.
-
-Cyclists at the outer borders of the road: a bicycle and a rider, two objects that move together.
-
-The speed of a cyclist is an Ornstein-Uhlenbeck process about a preferred speed. The rider's body sways sideways.
 """
 
 from __future__ import annotations
@@ -181,65 +177,4 @@ def simulate_pedestrians(
         velocity=(vs * stretch)[..., None] * tangent + vd[..., None] * normal,
         yaw=heading + np.where(sense[group] > 0, 0.0, np.pi),
         present=np.ones(s.shape, dtype=np.bool_),
-    )
-
-
-BICYCLE = (1.75, 0.6, 1.1)  # length, width, height, m
-SLOWEST = 1.0  # m/s
-CYCLIST_SPEED = (3.5, 6.5)  # preferred speed of a cyclist, m/s
-SPEED_SPREAD = 1.0  # standard deviation of a cyclist's speed about the preferred one, m/s
-CHANGE_TIME = 2.5  # correlation time of a cyclist's speed, s
-CYCLIST_SWAY, SWAY_PERIOD = 0.08, 1.2  # amplitude, m, and period, s, of the rider's body
-
-
-def simulate_cyclists(
-    road: Road,
-    borders: tuple[float, float],
-    window: tuple[float, float],
-    time: FloatArray,
-    number: tuple[int, int],
-    rng: np.random.Generator,
-) -> SimulatedTrajectories:
-    """Bicycles, then their riders, that start at road s within `window`, m, inside the outer borders (d, m).
-
-    number: fewest and most in each direction
-    """
-    h = float(time[1] - time[0])
-    decay = float(np.exp(-h / CHANGE_TIME))
-    parts = []
-    for sense, lateral in ((1.0, borders[0] + 0.7), (-1.0, borders[1] - 0.7)):
-        n = int(rng.integers(number[0], number[1] + 1))
-        preferred = rng.uniform(*CYCLIST_SPEED, n)
-        noise = SPEED_SPREAD * np.sqrt(1 - decay**2) * rng.standard_normal((len(time), n))
-        deviation = np.zeros((len(time), n))
-        deviation[0] = SPEED_SPREAD * rng.standard_normal(n)
-        for k in range(1, len(time)):
-            deviation[k] = decay * deviation[k - 1] + noise[k]
-        speed = np.maximum(preferred + deviation, SLOWEST)
-        travelled = np.concatenate([np.zeros((1, n)), np.cumsum((speed[1:] + speed[:-1]) / 2 * h, axis=0)])
-        s = rng.uniform(*window, n) + sense * travelled
-        phase = 2 * np.pi * (time[:, None] / SWAY_PERIOD + rng.random(n))
-        parts.append((s, np.full_like(s, lateral), speed, np.full_like(s, sense), CYCLIST_SWAY * np.sin(phase)))
-    s, d, speed, directions, sway = (np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True))
-    count = s.shape[1]
-    heading = road.heading_at(s) + np.where(directions > 0, 0.0, np.pi)
-    ground_speed = speed * (1 - road.curvature_at(s) * d)
-    velocity = ground_speed[..., None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-    return concatenated(
-        [
-            SimulatedTrajectories(
-                id=np.array([f"{name}-{k:03d}" for k in range(count)], dtype="<U16"),
-                label=np.full(count, label),
-                size=np.tile(np.array(size), (count, 1)),
-                time=time,
-                position=road.position(s, offset),
-                velocity=velocity,
-                yaw=heading,
-                present=np.ones(s.shape, dtype=np.bool_),
-            )
-            for name, label, size, offset in (
-                ("bicycle", "bicycle", BICYCLE, d),
-                ("rider", "pedestrian", BODY, d + sway),
-            )
-        ]
     )

@@ -6,7 +6,6 @@ traffic      the default settings
 red-light    a queue before a traffic light; frames have a map, the camera reports colours
 road-works   cones close the right lane and move its traffic into the adjacent lane; the map does not have the cones
 towing       many trucks, most of them with a trailer
-cycling      cyclists beside slow traffic
 two-sensors  a LiDAR with few points on far and small objects, and with outages; cameras that see far ahead
 """
 
@@ -204,7 +203,6 @@ class SimulatorSettings(Settings):
     )
     parking_probability: Fraction = setting(0.35, "share of roadsides with a strip of parked cars")
     pedestrian_groups: Count = setting((3, 8), "fewest and most groups of pedestrians within reach of the ego vehicle")
-    cyclists: Count = setting((0, 0), "fewest and most cyclists in each direction, at the outer borders of the road")
     mapped: bool = setting(False, "give frames a map of traffic lights, stop lines and lanes")
     traffic: TrafficSettings = settings_group(TrafficSettings, "vehicles")
     sensors: dict[str, SensorSettings] = settings_group(
@@ -212,7 +210,7 @@ class SimulatorSettings(Settings):
     )
 
 
-ScenarioName = Literal["traffic", "red-light", "road-works", "towing", "cycling", "two-sensors"]
+ScenarioName = Literal["traffic", "red-light", "road-works", "towing", "two-sensors"]
 
 
 _SETTINGS: Mapping[ScenarioName, SimulatorSettings] = {
@@ -231,7 +229,6 @@ _SETTINGS: Mapping[ScenarioName, SimulatorSettings] = {
         mapped=True,
     ),
     "towing": SimulatorSettings(traffic=TrafficSettings(truck_share=0.35, bus_share=0.02, trailer_share=0.8)),
-    "cycling": SimulatorSettings(cyclists=(5, 9)),
     "two-sensors": SimulatorSettings(
         keyframe_rate=2.0,
         annotation_range=100.0,

@@ -10,7 +10,6 @@ from data_tools.simulator.road import CAR
 from data_tools.simulator.road_users import (
     SimulatedTrajectories,
     concatenated,
-    simulate_cyclists,
     simulate_pedestrians,
     static_objects,
 )
@@ -33,7 +32,7 @@ from saga_fg.numerics import FloatArray, StrArray, yaw_transform
 from saga_fg.types import Detections, Frame, Scene
 
 SURROUNDED = (-300.0, 400.0)  # m along the road from the focus: extent of buildings, hedges, parked cars
-POPULATED = (-150.0, 100.0)  # m along the road from the focus: start positions of pedestrians and cyclists
+POPULATED = (-150.0, 100.0)  # m along the road from the focus: start positions of pedestrians
 UPSTREAM = (15.0, 140.0)  # m before the focus: start positions of the ego vehicle
 EARLY_MERGE = 10.0  # distance between the earliest and the latest positions of leaving the lane, m
 STEP = 0.05  # integration step, s
@@ -74,9 +73,6 @@ def build_world(settings: SimulatorSettings, seed: int) -> World:
     )
     parked = static_objects(_ids("parked", len(around.parked)), around.parked, history.time)
     others = vehicles.select(np.delete(np.arange(len(vehicles)), ego))
-    riders = simulate_cyclists(
-        layout.lanes.road, layout.borders, populated, history.time, settings.cyclists, streams[5]
-    )
     boxes = sample_cones(layout.lanes, streams[6])
     cones = static_objects(_ids("cone", len(boxes)), boxes, history.time)
     signals = signals_of(layout.lanes, layout.stop_lines)
@@ -84,7 +80,7 @@ def build_world(settings: SimulatorSettings, seed: int) -> World:
     if settings.mapped:
         road_map = sample_map(layout.lanes, layout.focus, layout.stop_lines, signals, streams[7])
     carrier = vehicles.select(np.array([ego]))
-    objects = concatenated([others, trailers, people, parked, riders, cones])
+    objects = concatenated([others, trailers, people, parked, cones])
     ego_pose = partial(pose_on_ground, carrier)
     return World(objects, around.occluders, ego_pose, signals, road_map, carrier, layout, history)
 

@@ -2,14 +2,14 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, get_args
 
 import typer
 
 from data_tools.datasets.nuscenes import write_nuscenes
 from data_tools.datasets.source import dataset_source
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
-from data_tools.simulator.settings import scenario_settings
+from data_tools.simulator.settings import ScenarioName, scenario_settings
 from pipelines.cli.console import counted, progress_bar, show_tables, working
 from pipelines.cli.options import Config, Verbose, as_command
 from pipelines.config import Family, load_config
@@ -19,8 +19,6 @@ from pipelines.serving import StreamSettings
 from pipelines.slam.configuration import load_slam_config
 from pipelines.smoothing import load_smooth_config
 from saga_fg.errors import InputError
-
-Scenario = Literal["traffic", "red-light", "road-works", "towing", "cycling", "two-sensors"]
 
 # Of each kind of settings, those one changes first.
 FIRST = {
@@ -130,7 +128,7 @@ def demo(
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of simulated scenes.")] = 3,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the simulation.")] = 0,
     scenario: Annotated[
-        Scenario,
+        ScenarioName,
         typer.Option("--scenario", help="What the scenes are about; those with a map by the heterogeneous settings."),
     ] = "traffic",
     config: Config = None,
@@ -156,7 +154,7 @@ def demo(
     typer.echo(f"page: {result.page}")
 
 
-MAPLESS: tuple[Scenario, ...] = ("traffic", "two-sensors")
+MAPLESS: tuple[ScenarioName, ...] = ("traffic", "two-sensors")
 """Scenarios without lights and lanes as objects, which the nuScenes layout has no place for."""
 
 
@@ -165,7 +163,7 @@ def simulate(
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Number of scenes.")] = 4,
     seed: Annotated[int, typer.Option("--seed", min=0, help="The same seed makes the same scenes.")] = 0,
     scenario: Annotated[
-        Scenario,
+        ScenarioName,
         typer.Option(
             "--scenario", help="What the scenes are about; all but traffic and two-sensors are written as tables."
         ),

@@ -23,7 +23,7 @@ import numpy as np
 from data_tools.datasets.mcap.dataset import RecordingOptions, message_content, placed_frames
 from data_tools.datasets.mcap.objects import OBJECT_TYPES, RESULTS, MessageObjects, message_objects
 from data_tools.datasets.mcap.recording import LoggedMessage
-from data_tools.datasets.mcap.ros2_types import definition, encoded
+from data_tools.datasets.mcap.ros2_types import encoded
 from data_tools.datasets.mcap.transforms import HOLD, ODOMETRY_TYPES, WORLD, TransformBuffer, find_places
 from data_tools.files import one_line
 from pipelines.serving.dds import Ros2Network, payload_decoder
@@ -38,8 +38,8 @@ log = logging.getLogger(__name__)
 PATIENCE = 0.5  # s
 _TOPIC = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 POLL = 0.05  # s between looks at the clock
-DETECTION_TYPES = tuple(name for name in OBJECT_TYPES if definition(name) is not None)
-RESULT_TYPES = {name.partition("/")[2]: name for name in RESULTS if definition(name) is not None}
+DETECTION_TYPES = tuple(OBJECT_TYPES)
+RESULT_TYPES = {name.partition("/")[2]: name for name in RESULTS}
 TRANSFORMS = {"/tf": ("tf2_msgs/TFMessage",), "/tf_static": ("tf2_msgs/TFMessage",)}
 
 

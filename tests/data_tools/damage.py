@@ -412,7 +412,7 @@ def _traffic(folder: Path) -> dict[str, Target]:
 
 def _recordings(folder: Path) -> dict[str, Target]:
     """A drive as MCAP and as SQLite, where the packages that write them are installed."""
-    if any(importlib.util.find_spec(name) is None for name in ("mcap_ros2", "mcap_protobuf", "rosbags")):
+    if any(importlib.util.find_spec(name) is None for name in ("mcap_ros2", "rosbags")):
         return {}
     from data_tools.datasets.mcap.dataset import McapRecording
     from tests.data_tools import mcap_example as example

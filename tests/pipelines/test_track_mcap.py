@@ -1,8 +1,7 @@
-"""From a recording of ROS 2 or Foxglove to tracks in it, through the command; results are read by other libraries."""
+"""From a recording of ROS 2 to tracks in it, through the command; results are read by other libraries."""
 
 import json
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -66,51 +65,6 @@ def test_detection_arrays_in_and_out_under_their_own_names(tmp_path):
     assert (topic, kind) == (TOPIC, ARRAY)
     assert {each.results[0].hypothesis.class_id for each in last.detections} == {"CAR", "PEDESTRIAN"}
     assert len({each.id for each in last.detections}) == 2
-
-
-def test_foxglove_scenes_in_and_out(tmp_path):
-    pytest.importorskip("foxglove_schemas_protobuf")
-    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-    from mcap_protobuf.decoder import DecoderFactory
-    from mcap_protobuf.writer import Writer
-
-    path = tmp_path / "scene.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        for k in range(MOMENTS):
-            seconds, nanos = divmod(START + k * STEP, 10**9)
-            time = {"timestamp": {"seconds": seconds, "nanos": nanos}}
-            entities = [
-                {
-                    **time,
-                    "frame_id": "map",
-                    "id": label,
-                    "metadata": [{"key": "Class", "value": label}, {"key": "score", "value": "0.8"}],
-                    "cubes": [
-                        {"pose": {"position": example.vector(*place), "orientation": example.turn(np.pi / 2)},
-                         "size": example.vector(*size)}
-                    ],
-                }
-                for label, place, _, size in example.objects(k)
-            ]  # fmt: skip
-            entities.append({**time, "frame_id": "elsewhere", "id": "a line", "lines": [{}]})
-            update = SceneUpdate(deletions=[{**time, "type": 1}], entities=entities if k % 5 else [])
-            writer.write_message("/boxes", update, log_time=START + k * STEP)
-        writer.finish()
-    code, output = saga_fg("track", "mcap", path, "--output", tmp_path / "tracks.mcap")
-    assert code == 0, output
-    from mcap.reader import make_reader
-
-    with (tmp_path / "tracks.mcap").open("rb") as file:
-        *_, last = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
-    assert last.schema.name == "foxglove.SceneUpdate"
-    cars = [
-        e
-        for e in last.decoded_message.entities
-        if {"class": "car"}.items() <= {m.key: m.value for m in e.metadata}.items()
-    ]
-    assert [cars[0].cubes[0].pose.position.y] == pytest.approx(example.objects(LAST)[0][1][1:2], abs=0.2)
-    assert cars[0].frame_id == "map"
 
 
 def test_results_are_shown_and_judged(tmp_path, drive):

@@ -1,4 +1,4 @@
-"""Objects of messages: raw rows of three families of types, checked field by field, and tracks as messages of each.
+"""Objects of messages: raw rows of two families of types, checked field by field, and tracks as messages of each.
 
 `autoware_perception_msgs/DetectedObjects` and `TrackedObjects`. Poses are in the frame of the header, velocities over
 ground along the axes of the object, as Autoware has them. The score is the existence probability, the class the most
@@ -10,12 +10,6 @@ of the same type; `id` is that of the track. There is no place for a velocity. S
 https://github.com/ros-perception/vision_msgs, version 4 (Humble and later).
 
 `visualization_msgs/MarkerArray`, of results alone: a box and a text for each track, for RViz.
-
-Foxglove's `SceneUpdate`: an entity is an object if it has a cube, a cylinder or a sphere, of which the first counts.
-Class and score are taken from the metadata (the first of `class`, `label`, `category`, `type`; of `score`,
-`confidence`, `probability`), the class else from the first text, the velocity from `vx` and `vy`. Every message shows
-all objects of its time. Results are `foxglove.SceneUpdate` in protobuf, with the same metadata and `id`. Source:
-https://docs.foxglove.dev/docs/sdk/schemas/scene-update.
 """
 
 from collections.abc import Callable, Mapping
@@ -33,7 +27,6 @@ from saga_fg.numerics import (
     StrArray,
     quaternion_norms,
     quaternion_rotation,
-    upper_triangle,
     yaw_of,
     yaw_quaternion,
 )
@@ -83,7 +76,7 @@ class ObjectRows:
 class ObjectType(NamedTuple):
     """A type of message with objects.
 
-    result   type of results: in ROS 2's encoding if it has a definition, in protobuf else
+    result   type of results
     rows     the objects of a message; raises `AttributeError` where a field is missing
     message  a message of tracks, with its time, ns, the name of its frame, and the names of classes in the recording
     """
@@ -330,6 +323,12 @@ def _vision_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, 
     return {"header": head, "detections": Columns(len(boxes), detections)}
 
 
+_COLOUR = {"r": 0.1, "g": 0.45, "b": 0.9, "a": 0.5}
+_TEXT_GAP = 0.4  # m above the box
+_UNKNOWN_SIZE = 0.5  # m
+_CUBE, _TEXT, _DELETE_ALL, _MARKERS = 1, 9, 3, "saga_fg"  # types and action of markers, their namespace
+
+
 def _marker_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, str]) -> Message:
     """A box and a text for each track; the first marker removes those before."""
     boxes, n = tracks.boxes, len(tracks)
@@ -362,114 +361,15 @@ def _marker_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, 
     return {"markers": Columns(1 + 2 * n, markers)}
 
 
-_SCENE_FIELDS = {
-    "position": "object {}: pose.position",
-    "rotation": "object {}: pose.orientation",
-    "covariance": "object {}: metadata: cov_xx, cov_xy, cov_yy",
-    "size": "object {}: size",
-    "score": "object {}: metadata: score",
-    "velocity": "object {}: metadata: vx, vy",
-    "velocity_covariance": "object {}: metadata: cov_vxvx, cov_vxvy, cov_vyvy",
-}
-_CLASS, _SCORE = ("class", "label", "category", "type"), ("score", "confidence", "probability")
-_POSITION, _VELOCITY = ("cov_xx", "cov_xy", "cov_yy"), ("cov_vxvx", "cov_vxvy", "cov_vyvy")
-_COLOUR = {"r": 0.1, "g": 0.45, "b": 0.9, "a": 0.5}
-_TEXT_GAP = 0.4  # m above the box
-_UNKNOWN_SIZE = 0.5  # m
-_CUBE, _TEXT, _DELETE_ALL, _MARKERS = 1, 9, 3, "saga_fg"  # types and action of markers, their namespace
-
-
-def _scene_rows(message: Any) -> ObjectRows:
-    """Raises `InputError` for entities in several frames."""
-    solids = [(each, _solid(each)) for each in message.entities]
-    objects = [(each, solid) for each, solid in solids if solid is not None]
-    stamps = [nanoseconds(each.timestamp) for each in (*(each for each, _ in objects), *message.deletions)]
-    frames = list(dict.fromkeys(frame_name(each.frame_id) for each, _ in objects))
-    if len(frames) > 1:
-        raise InputError(f"entities: expected all in one frame, got {', '.join(frames)}")
-    found = ObjectRows(max(stamps, default=0), frames[0] if frames else "", _SCENE_FIELDS)
-    for k, (each, solid) in enumerate(objects):
-        facts = {fact.key.lower(): fact.value for fact in each.metadata}
-        text = each.texts[0].text if len(each.texts) else ""
-        found.objects.append(
-            ObjectRow(
-                id=facts.get("id", each.id),
-                label=next((facts[name] for name in _CLASS if name in facts), text),
-                score=_number(facts, k, next((name for name in _SCORE if name in facts), ""), 1.0),
-                position=xyz(solid.pose.position),
-                rotation=wxyz(solid.pose.orientation),
-                size=xyz(solid.size),
-                velocity=(_number(facts, k, "vx"), _number(facts, k, "vy"), 0.0),
-                covariance=_entries(*(_number(facts, k, name) for name in _POSITION)),
-                velocity_covariance=_entries(*(_number(facts, k, name) for name in _VELOCITY)),
-            )
-        )
-    return found
-
-
-def _scene_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, str]) -> Any:
-    """A cube, a text and metadata for each track."""
-    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-
-    seconds, nanos = divmod(stamp, 10**9)
-    time, boxes = {"timestamp": {"seconds": seconds, "nanos": nanos}}, tracks.boxes
-    spreads = [upper_triangle(P) for P in (tracks.position_covariance, tracks.velocity_covariance)]
-    columns = np.column_stack([tracks.score, boxes.velocity, *spreads]).tolist()
-    entities: list[Any] = []
-    for k, (id_, label) in enumerate(zip(tracks.id.tolist(), boxes.label.tolist(), strict=True)):
-        keys = ("score", "vx", "vy", *_POSITION, *_VELOCITY)
-        known = {key: f"{value:.6g}" for key, value in zip(keys, columns[k], strict=True) if value == value}
-        facts = {"id": str(id_), "class": names.get(label, label), **known}
-        if not tracks.settled[k]:
-            facts["settled"] = "0"
-        size = np.where(np.isfinite(boxes.size[k]), boxes.size[k], _UNKNOWN_SIZE)
-        above = boxes.position[k] + [0, 0, size[2] / 2 + _TEXT_GAP]
-        text = {"pose": pose(above, 0.0), "billboard": True, "font_size": 12.0, "scale_invariant": True}
-        entities.append(
-            {
-                **time,
-                "frame_id": frame,
-                "id": f"track {id_}",
-                "metadata": [{"key": key, "value": value} for key, value in facts.items()],
-                "cubes": [{"pose": pose(boxes.position[k], boxes.yaw[k]), "size": vector(size), "color": _COLOUR}],
-                "texts": [{**text, "color": {**_COLOUR, "a": 1.0}, "text": f"{facts['class']} {id_}"}],
-            }
-        )
-    deletions: list[Any] = [{**time, "type": 1}]
-    return SceneUpdate(deletions=deletions, entities=entities)
-
-
-def _solid(entity: Any) -> Any:
-    """The first cube, cylinder or sphere of an entity; None for lines, arrows and others."""
-    return next((solids[0] for solids in (entity.cubes, entity.cylinders, entity.spheres) if len(solids)), None)
-
-
-def _number(facts: Mapping[str, str], row: int, name: str, default: float = NAN) -> float:
-    if name not in facts:
-        return default
-    try:
-        return float(facts[name])
-    except ValueError:
-        raise InputError(f"object {row}: metadata: {name}: expected a number, got {facts[name][:40]!r}") from None
-
-
-def _entries(xx: float, xy: float, yy: float) -> tuple[float, ...]:
-    """The 36 entries of a covariance by those of its horizontal part."""
-    return (xx, xy, *NO_COVARIANCE[2:6], xy, yy, *NO_COVARIANCE[8:])
-
-
 _AUTOWARE = ObjectType("autoware_perception_msgs/TrackedObjects", autoware_rows, autoware_message)
 _VISION = ObjectType("vision_msgs/Detection3DArray", _vision_rows, _vision_message)
-_SCENE = ObjectType("foxglove.SceneUpdate", _scene_rows, _scene_message)
 OBJECT_TYPES = {
     "autoware_perception_msgs/DetectedObjects": _AUTOWARE,
     "autoware_perception_msgs/TrackedObjects": _AUTOWARE,
     "vision_msgs/Detection3DArray": _VISION,
-    "foxglove.SceneUpdate": _SCENE,
-    "foxglove_msgs/SceneUpdate": _SCENE,
 }
 RESULTS = {
-    **{each.result: each.message for each in (_AUTOWARE, _VISION, _SCENE)},
+    **{each.result: each.message for each in (_AUTOWARE, _VISION)},
     "visualization_msgs/MarkerArray": _marker_message,
 }
 """The message of tracks of each type of results."""

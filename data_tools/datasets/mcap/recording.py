@@ -1,7 +1,7 @@
 """Messages of a recording: a file of MCAP, or a bag folder of ROS 2 with files of MCAP or SQLite in it.
 
 Messages in ROS 2's encoding (CDR) are decoded by the definition that the recording holds, where it holds none by the
-one of `ros2_types`; those in protobuf by the recording's descriptors. Decoders come with the extra [mcap].
+one of `ros2_types`. The decoder comes with the extra [mcap].
 
 Sources: https://mcap.dev/spec; the storage plugins of https://github.com/ros2/rosbag2.
 """
@@ -52,7 +52,7 @@ class Recording:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        if any(find_spec(name) is None for name in ("foxglove_schemas_protobuf", "mcap_protobuf", "mcap_ros2")):
+        if find_spec("mcap_ros2") is None:
             raise MissingExtraError("recordings of ROS 2 need mcap: pip install 'saga-fg[mcap]'")
         self.files = _files(self.path)
         self.topics: dict[str, Topic] = {}
@@ -238,23 +238,21 @@ def _split_number(path: Path) -> tuple[str, int, str]:
 
 def _decoder(where: str, schema: Any, encoding: str) -> Decode:
     """The function that decodes messages of a schema. Raises `InputError` that begins with `where` for none."""
-    import mcap_protobuf.decoder
-    import mcap_ros2.decoder
     from mcap.records import Schema
+    from mcap_ros2.decoder import DecoderFactory
 
-    if schema is not None and encoding == "cdr" and schema.encoding != "ros2msg":
+    if schema is None or encoding != "cdr":
+        raise InputError(f"{where}: expected messages encoded as cdr (ROS 2), got {encoding!r}")
+    if schema.encoding != "ros2msg":
         text = definition(schema.name)
         if text is None:
             raise InputError(
                 f"{where}: expected the definition of {schema.name} in the recording, it has none as ros2msg"
             )
         schema = Schema(id=schema.id or 1, name=schema.name, encoding="ros2msg", data=text.encode())
-    for factory in (mcap_ros2.decoder.DecoderFactory(), mcap_protobuf.decoder.DecoderFactory()):
-        with one_line("not readable", where):
-            decode = factory.decoder_for(encoding, schema)
-        if decode is not None:
-            return decode
-    raise InputError(f"{where}: expected messages encoded as cdr (ROS 2) or protobuf, got {encoding!r}")
+    with one_line("not readable", where):
+        decode: Decode = DecoderFactory().decoder_for(encoding, schema)
+    return decode
 
 
 def _cut_off(path: Path) -> bool:

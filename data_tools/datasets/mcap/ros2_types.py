@@ -267,9 +267,7 @@ def _place(body: bytearray, leaves: list[_Leaf], n: int) -> None:
 
 
 def nanoseconds(stamp: Any) -> int:
-    """ns of a ROS time (sec, nanosec) or a protobuf timestamp (seconds, nanos)."""
-    if hasattr(stamp, "seconds"):
-        return checked_time(int(stamp.seconds) * 10**9 + int(stamp.nanos))
+    """ns of a ROS time (sec, nanosec)."""
     return checked_time(int(stamp.sec) * 10**9 + int(stamp.nanosec))
 
 

@@ -1,16 +1,16 @@
-"""Recordings of ROS 2 and Foxglove as a dataset of the command, and tracks as messages.
+"""Recordings of ROS 2 as a dataset of the command, and tracks as messages.
 
 Tracks as messages of a file of MCAP, in the type that the detections had, and read back.
 
 The topic is `/saga_fg/tracks`, the frame the one that was tracked in, the times are those of the detections.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, BinaryIO, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -46,31 +46,22 @@ def write_track_messages(path: Path, dataset: McapRecording, scenes: Iterable[tu
 
     Classes go back to the names of the recording. Raises `InputError` for a path that is not writable.
     """
+    from mcap.writer import Writer
+
+    type_ = dataset.form.result
     with atomic_file(path) as file:
-        write, finish = _writer(file, dataset.form.result)
+        writer = Writer(file)
+        writer.start(profile="ros2", library="saga-fg")
+        text = definition(type_) or ""
+        schema = writer.register_schema(type_.replace("/", "/msg/"), "ros2msg", text.encode())
+        channel = writer.register_channel(TOPIC, "cdr", schema)
         for scene, moments in scenes:
             assert isinstance(scene, RecordedScene)
             for token, tracks in zip(scene.tokens, moments, strict=True):
                 stamp = int(token)
                 message = dataset.form.message(tracks, stamp, scene.world, dataset.options.names)
-                write(message, stamp)
-        finish()
-
-
-def _writer(file: BinaryIO, type_: str) -> tuple[Callable[[Any, int], None], Callable[[], None]]:
-    """Functions that write a message of a type with its time, ns, and that end the file."""
-    import mcap_protobuf.writer
-    from mcap.writer import Writer
-
-    text = definition(type_)
-    if text is None:
-        protobuf: Any = mcap_protobuf.writer.Writer(file)
-        return lambda message, time: protobuf.write_message(TOPIC, message, time, time), protobuf.finish
-    ros = Writer(file)
-    ros.start(profile="ros2", library="saga-fg")
-    schema = ros.register_schema(type_.replace("/", "/msg/"), "ros2msg", text.encode())
-    channel = ros.register_channel(TOPIC, "cdr", schema)
-    return lambda message, time: ros.add_message(channel, time, encoded(type_, message), time), ros.finish
+                writer.add_message(channel, stamp, encoded(type_, message), stamp)
+        writer.finish()
 
 
 def read_track_messages(
@@ -132,11 +123,11 @@ class McapFormat(ResultFormat):
 
 @dataclass(frozen=True, kw_only=True)
 class McapSource(DatasetSource):
-    """Recordings of ROS 2 or Foxglove: a file of MCAP or a bag folder; needs the extra [mcap], no installation of ROS.
+    """Recordings of ROS 2: a file of MCAP or a bag folder; needs the extra [mcap], no installation of ROS.
 
-    Topics of Autoware's DetectedObjects and TrackedObjects, vision_msgs/Detection3DArray and Foxglove's SceneUpdate;
-    the pose of the vehicle from /tf or nav_msgs/Odometry. Without --topic, the one topic that holds objects is taken,
-    and if there are several, they are listed.
+    Topics of Autoware's DetectedObjects and TrackedObjects, and vision_msgs/Detection3DArray; the pose of the vehicle
+    from /tf or nav_msgs/Odometry. Without --topic, the one topic that holds objects is taken, and if there are several,
+    they are listed.
     """
 
     name = "mcap"

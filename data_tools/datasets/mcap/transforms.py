@@ -30,7 +30,7 @@ from saga_fg.numerics import (
     quaternion_rotation,
 )
 
-TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "foxglove.FrameTransforms", "foxglove.FrameTransform")
+TRANSFORM_TYPES = ("tf2_msgs/TFMessage",)
 ODOMETRY_TYPES = ("nav_msgs/Odometry",)
 DEFAULT_EGO = "base_link"
 WORLD = "map"  # of a live system
@@ -208,15 +208,10 @@ def transform_records(logged: LoggedMessage) -> Iterator[TransformRecord]:
         head, pose = message.header, message.pose.pose
         child = frame_name(message.child_frame_id) or DEFAULT_EGO
         edges = [(head.stamp, head.frame_id, child, pose.position, pose.orientation)]
-    elif logged.topic.type == "tf2_msgs/TFMessage":
+    else:
         edges = [
             (each.header.stamp, each.header.frame_id, each.child_frame_id, T.translation, T.rotation)
             for each, T in ((each, each.transform) for each in message.transforms)
-        ]
-    else:
-        edges = [
-            (each.timestamp, each.parent_frame_id, each.child_frame_id, each.translation, each.rotation)
-            for each in getattr(message, "transforms", [message])
         ]
     static = logged.topic.name.endswith("tf_static")
     for stamp, parent, child, translation, rotation in edges:

@@ -1,4 +1,4 @@
-"""Recordings of ROS 2 and Foxglove, written by other libraries, as scenes; and what is wrong with broken ones."""
+"""Recordings of ROS 2, written by other libraries, as scenes; and what is wrong with broken ones."""
 
 import logging
 import sqlite3
@@ -280,7 +280,7 @@ def test_a_bag_is_read_from_plain_tables_alone(tmp_path, subtests):
 
 
 def test_times_of_a_bag_that_are_none_or_beyond_64_bits_are_named(tmp_path):
-    far = SimpleNamespace(seconds=2**62, nanos=0)
+    far = SimpleNamespace(sec=2**62, nanosec=0)
     with pytest.raises(InputError, match=r"time: expected nanoseconds within 64 bits"):
         nanoseconds(far)
     assert nanoseconds(SimpleNamespace(sec=-1, nanosec=1)) == 1 - 10**9

@@ -124,7 +124,7 @@ def test_reaction_time_and_noise_cause_no_collision(seed):
     assert history.speed.min() >= 0.0
 
 
-# The simulator's scenarios: lights, cones, trailers and cyclists
+# The simulator's scenarios: lights, cones and trailers
 
 SHORT = 6.0  # s
 
