@@ -251,8 +251,8 @@ def _decoder(where: str, schema: Any, encoding: str) -> Decode:
             )
         schema = Schema(id=schema.id or 1, name=schema.name, encoding="ros2msg", data=text.encode())
     with one_line("not readable", where):
-        decode: Decode = DecoderFactory().decoder_for(encoding, schema)
-    return decode
+        decode: Any = DecoderFactory().decoder_for(encoding, schema)
+    return decode  # type: ignore[no-any-return]
 
 
 def _cut_off(path: Path) -> bool:

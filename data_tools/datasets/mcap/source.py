@@ -50,7 +50,7 @@ def write_track_messages(path: Path, dataset: McapRecording, scenes: Iterable[tu
 
     type_ = dataset.form.result
     with atomic_file(path) as file:
-        writer = Writer(file)
+        writer: Any = Writer(file)
         writer.start(profile="ros2", library="saga-fg")
         text = definition(type_) or ""
         schema = writer.register_schema(type_.replace("/", "/msg/"), "ros2msg", text.encode())
