@@ -11,10 +11,8 @@ import pytest
 
 from benchmarks import kills
 from benchmarks.endurance import EDGES, LONG, NONE, endurance
-from benchmarks.filters import JointGraphTracking, SeparateGraphTracking
-from benchmarks.flocks import flock
 from benchmarks.kills import Killed, _damage, _kill, _marked
-from benchmarks.scaling import APART, JOINT, NODES, SEPARATE
+from benchmarks.scaling import APART, JOINT, NODES, SEPARATE, JointGraphTracking, SeparateGraphTracking, flock
 from benchmarks.service import clocks
 from benchmarks.service.clocks import ClockFault, fault_rows, offset_figures, offset_shortcomings
 from benchmarks.service.good_client import GoodClient
@@ -212,7 +210,7 @@ def test_with_all_correlations_edges_say_nothing_that_nodes_do_not(bench):
 
 def test_edges_of_their_own_are_right_where_nothing_couples_the_nodes():
     """Without interactions the nodes are independent, and both filters are the classical one."""
-    drawn = flock("connected", 3, 15, 0, mixing=0.0)
+    drawn = flock(3, 15, 0, mixing=0.0)
     together, apart = JointGraphTracking(drawn), SeparateGraphTracking(drawn)
     for frame in drawn.frames:
         for each in (together, apart):

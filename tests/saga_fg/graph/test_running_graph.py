@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from benchmarks.sampled_traffic import DetectionProvider, ObjectProvider, VehicleProvider, providers, sample_traffic
+from tests.saga_fg.sampled_traffic import DetectionProvider, ObjectProvider, VehicleProvider, providers, sample_traffic
 from factors import ResidualFactors, Robust, SolverSettings, prior_factor
 from saga_fg import ConstantVelocity, NodeType, SceneGraph
 from saga_fg.conformance.programs import (

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from benchmarks.sampled_traffic import providers, sample_traffic
+from tests.saga_fg.sampled_traffic import providers, sample_traffic
 from factors import (
     SolverSettings,
     Vector,

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from benchmarks.sampled_traffic import Interaction
+from tests.saga_fg.sampled_traffic import Interaction
 from factors import Vector
 from factors.manifolds import central_differences
 from saga_fg import InputError

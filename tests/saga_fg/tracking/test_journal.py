@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.sampled_traffic import providers, sample_traffic
+from tests.saga_fg.sampled_traffic import providers, sample_traffic
 from factors import ResidualFactors
 from saga_fg import Detection, Detections, Frame, Sensor, Tracker, TrackerSettings, Tracks
 from saga_fg.estimators import IncrementalSmoother
