@@ -1,48 +1,68 @@
 """SLAM on drives past landmarks: trees of unknown identity (Victoria Park), and ranges to beacons (Plaza).
 
+Pose and trees are one Gaussian (`LocalMap`), whose correlations the gates of association need. After every
+`SMOOTH_EVERY` observations all measurements are solved together, so that linearisation errors do not add up, and trees
+that were begun twice, while the pose was poorly known, are merged:
+
+    delta_ij = l_j - l_i,        S_ij = P_ii + P_jj - P_ij - P_ji
+
+Two may be one where d^2 = delta^T S^-1 delta is inside the gate, unless they were seen together from one pose. A single
+pair says little where S is large. But differences are correlated: if one pair is one tree, the others are known much
+better. For a set of pairs the odds of being one against being two multiply, each pair given those before it,
+
+    log odds(set) = sum_k log odds( delta_k | delta_1 = 0, ..., delta_{k-1} = 0 )
+
+so that a constellation is recognised where no single tree is. From each pair as a seed the set grows by the likeliest
+pair as long as that raises the odds; the likeliest set of all is merged, if its odds are better than even. To judge
+pairs jointly is the idea of J. Neira and J. D. Tardos (IEEE Transactions on Robotics and Automation 17, 2001).
+
 The covariances of a recording's odometry assume independent errors. True errors persist (a wheel slips through the
-whole bend), and add up to more. So a scale of the covariances is chosen first for a drive past trees, the likeliest of
-a few on the beginning (`LandmarkMapper.log_evidence`); the identities in the file are not used.
+whole bend), and add up to more. So a scale of the covariances is chosen first, the likeliest of a few on the beginning;
+the identities in the file are not used. The evidence is Laplace's approximation at the solution x* with information H:
+
+    log p(z) = -E(x*) - 1/2 log det H + D/2 log 2 pi - 1/2 sum_i log det 2 pi R_i + sum_landmarks log density
+
+Trees are compared with the identities in the file by all pairs of observations (Manning, Raghavan and Schuetze,
+Introduction to Information Retrieval, 2008, section 16.3).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence, Set
+from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import typer
+from numpy.typing import ArrayLike
 
-from benchmarks.agreement import pairwise_agreement
-from benchmarks.landmark_mapper import LandmarkMapper, MapperSettings
 from benchmarks.recordings.landmarks import LandmarkLog, read_landmark_log
 from benchmarks.recordings.ranges import compared, map_beacons
 from benchmarks.runner import Rows, each
-from data_tools.figures import paths_from_above, png, write_figures
-from data_tools.files import atomic_directory, check_writable_folder, write_bytes
-from data_tools.trajectories import Trajectory, write_kitti_poses, write_tum_poses
-from pipelines.slam.results import landmark_row, landmark_rows, planar_trajectory
+from factors import Solution, SolverSettings
 from saga_fg.errors import InputError
-from saga_fg.model import PointLandmark
-from saga_fg.numerics import FloatArray
-from saga_fg.types import Observation
+from saga_fg.graph import SceneFactorGraph, ask_all
+from saga_fg.model.landmarks import PointLandmark
+from saga_fg.numerics.arrays import FloatArray, IntArray
+from saga_fg.numerics.assignment import gate
+from saga_fg.slam.mapping import LandmarkObservations, LocalMap, MeasuredMotion, associate, landmark_key, pose_key
+from saga_fg.slam.mapping.local_map import log_odds
+from saga_fg.types.frame import Observation
 
 SCALES = (1.0, 4.0, 16.0, 64.0, 256.0)  # of the covariance, to choose of
 BEGINNING = 2000  # poses on which that is chosen
 TREE = PointLandmark(name="tree", density=0.01)  # one on 10 m by 10 m
-MAPPER = MapperSettings(smooth_every=300)
-_START = 1e-6  # variance of the first pose, m^2 and rad^2
-
-_Found = tuple[FloatArray, list[dict[str, Any]], dict[str, Any], dict[str, FloatArray]]
-"""world_T_pose (N, 3, 3), rows of landmarks.json, figures, and further paths for the picture."""
+SMOOTH_EVERY = 300  # observations
+START = 1e-6 * np.eye(3)  # covariance of the first pose, m^2 and rad^2
+_GATE = 1 - 1e-6  # probability, of merging; near 1, since an outlier begins a tree anew
+_SAME = 1e-6  # variance of the difference of a tree from itself, for the numerics
+_SEEDS = 40  # pairs that sets are grown from, the likeliest
+_SOLVER = SolverSettings(tolerance=1e-2, max_iterations=20)
 
 
 def landmarks(
     file: Annotated[Path, typer.Argument(help="victoria_park.txt, or NAME_DR.txt of Plaza with the others beside it.")],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Folder for trajectory, landmarks, figures and a picture.")
-    ] = None,
     odometry_scale: Annotated[
         float | None,
         typer.Option("--odometry-scale", help="Of the covariance of Victoria Park; chosen from data if left out."),
@@ -54,74 +74,33 @@ def landmarks(
 
     \b
     Examples:
-      python -m benchmarks landmarks data/slam/victoria_park.txt --output park
-      python -m benchmarks landmarks data/slam/Plaza2_DR.txt --output plaza2
+      python -m benchmarks landmarks data/slam/victoria_park.txt
+      python -m benchmarks landmarks data/slam/Plaza2_DR.txt
     """
     if odometry_scale is not None and not 0 < odometry_scale < np.inf:
         raise InputError(f"--odometry-scale {odometry_scale:g}: expected a number > 0")
-    if output is not None:
-        check_writable_folder(output)
     drive = read_landmark_log(file)
-    ranges = drive.value.shape[1] == 1
-    if ranges and odometry_scale is not None:
-        raise InputError(f"--odometry-scale: expected a drive past trees, {file} has ranges")
-    poses, rows, figures, paths = _beacons(drive) if ranges else _park(drive, odometry_scale)
-    if output is not None:
-        write_landmark_map(output, planar_trajectory(drive.time, poses), rows, figures, paths)
-    yield f"{file.name}: {len(poses)} poses, {len(drive.value)} observations, {len(rows)} landmarks", figures
+    title = f"{file.name}: {len(drive.time)} poses, {len(drive.value)} observations"
+    if drive.value.shape[1] == 1:
+        if odometry_scale is not None:
+            raise InputError(f"--odometry-scale: expected a drive past trees, {file} has ranges")
+        yield title, compared(drive, map_beacons(drive))
+        return
+    scale = odometry_scale
+    if scale is None:
+        evidence = {one: driven(drive, one, BEGINNING).log_evidence() for one in SCALES}
+        yield "log evidence by odometry scale", {f"{k:g}": v for k, v in evidence.items()}
+        scale = max(evidence, key=lambda one: evidence[one])
+    park = driven(drive, scale)
+    park.smooth()
+    agreement = pairwise_agreement(park.numbers(), drive.landmark)
+    counts = {"trees": len(park.local.kinds), "named in the file": len(np.unique(drive.landmark))}
+    yield title, {**counts, "odometry scale": scale, **{f"pairwise {k}": v for k, v in agreement._asdict().items()}}
 
 
-def _beacons(drive: LandmarkLog) -> _Found:
-    found = map_beacons(drive)
-    rows = []
-    for number, (x, y) in found.beacons.items():
-        seen = int((drive.landmark == number).sum())
-        rows.append(landmark_row(number, "beacon", {"x": float(x), "y": float(y)}, found.covariances[number], seen))
-    return found.world_T_pose, rows, *compared(drive, found)
-
-
-def _park(drive: LandmarkLog, scale: float | None) -> _Found:
-    scales = SCALES if scale is None else (scale,)
-    tried = {one: _driven(drive, one, BEGINNING).log_evidence() for one in scales} if scale is None else {}
-    chosen = max(scales, key=lambda one: tried.get(one, 0.0))
-    park = _driven(drive, chosen).map()
-    agreement = pairwise_agreement([one.landmark for one in park.observations], drive.landmark)
-    counts = {"poses": len(drive.time), "observations": len(drive.landmark), "landmarks": len(park.landmarks)}
-    named = {"landmarks named in the file": len(np.unique(drive.landmark))}
-    pairs = {
-        "pairwise precision": agreement.precision,
-        "pairwise recall": agreement.recall,
-        "pairwise F1": agreement.f1,
-        "odometry scale": chosen,
-        "log evidence by odometry scale": {f"{one:g}": value for one, value in tried.items()},
-    }
-    return park.world_T_pose, landmark_rows(park.landmarks), {**counts, **named, **pairs}, {}
-
-
-def write_landmark_map(
-    output: Path,
-    trajectory: Trajectory,
-    landmarks: Sequence[Mapping[str, Any]],
-    figures: Mapping[str, object],
-    others: Mapping[str, FloatArray] | None = None,
-) -> None:
-    """Write trajectory.tum, trajectory.kitti, landmarks.json, figures.json and above.png.
-
-    landmarks: rows of landmarks.json; others: further paths (n, 2 or 3) for the picture, by name
-    """
-    places = np.array([[row["x"], row["y"], row.get("z", 0.0)] for row in landmarks]).reshape(-1, 3)
-    picture = paths_from_above({**(others or {}), "estimate": trajectory.positions}, {"landmarks": places})
-    with atomic_directory(output) as folder:
-        write_tum_poses(folder / "trajectory.tum", trajectory)
-        write_kitti_poses(folder / "trajectory.kitti", trajectory)
-        write_figures(folder / "landmarks.json", landmarks)
-        write_figures(folder / "figures.json", dict(figures))
-        write_bytes(folder / "above.png", png(picture))
-
-
-def _driven(drive: LandmarkLog, scale: float, most: int | None = None) -> LandmarkMapper:
+def driven(drive: LandmarkLog, scale: float, most: int | None = None) -> TreeMapper:
     """The mapper after the first poses, or all of them."""
-    mapper = LandmarkMapper(np.eye(3), _START * np.eye(3), MAPPER)
+    mapper = TreeMapper()
     begin = np.searchsorted(drive.pose, np.arange(len(drive.time) + 1)).tolist()
     for pose in each(range(len(drive.time))[:most], f"odometry covariance x {scale:g}"):
         if pose:
@@ -129,3 +108,153 @@ def _driven(drive: LandmarkLog, scale: float, most: int | None = None) -> Landma
         rows = range(begin[pose], begin[pose + 1])
         mapper.observe([Observation(TREE, drive.value[row], drive.covariance[row]) for row in rows])
     return mapper
+
+
+class TreeMapper:
+    """Builds a map of points in the plane from odometry and observations, one pose after the other."""
+
+    def __init__(self) -> None:
+        self.local = LocalMap(np.eye(3), START)
+        self._motions = [(np.eye(3), START)]
+        self._seen: dict[int, list[tuple[int, Observation]]] = {}  # by pose, each with the number of its tree
+        self._poses = np.empty((0, 3, 3))  # at the last solution
+        self._numbers = self._since = 0
+
+    def move(self, a_T_b: FloatArray, covariance: FloatArray) -> None:
+        """Go on to the next pose by odometry: a_T_b (3, 3), covariance (3, 3) of its tangent."""
+        self.local.predict(a_T_b, covariance)
+        self._motions.append((a_T_b, covariance))
+
+    def observe(self, observations: Sequence[Observation]) -> None:
+        """Add observations from the present pose; one without a clear match begins a new tree."""
+        pairs = associate(self.local, observations) if observations else {}
+        if pairs:
+            self.local.update(list(pairs.values()))
+        now = self._seen.setdefault(len(self._motions) - 1, []) if observations else []
+        for row, observation in enumerate(observations):
+            if row not in pairs:
+                self._numbers += 1
+                self.local.augment(self._numbers, observation)
+            now.append((pairs[row].landmark if row in pairs else self._numbers, observation))
+        self._since += len(observations)
+        if self._since >= SMOOTH_EVERY:
+            self.smooth()
+
+    def smooth(self) -> Solution:
+        """Solve all measurements together, and merge trees that are one, until none are left."""
+        self._since = 0
+        while True:
+            solution = self._solved()
+            merged = duplicates(self.local, self._seen_together())
+            if not merged:
+                return solution
+            self._seen = {pose: [(merged.get(n, n), z) for n, z in now] for pose, now in self._seen.items()}
+
+    def log_evidence(self) -> float:
+        """log p(z) of all measurements so far."""
+        solution = self.smooth()
+        noise = [Q for _, Q in self._motions] + [z.covariance for now in self._seen.values() for _, z in now]
+        half_log_det = float(solution.linear.eliminateMultifrontal().logDeterminant())
+        volume = 0.5 * sum(solution.values.dims().values()) * float(np.log(2 * np.pi))
+        normaliser = 0.5 * sum(float(np.linalg.slogdet(2 * np.pi * R)[1]) for R in noise)
+        begun = len(self.local.kinds) * float(np.log(TREE.density))
+        return -solution.error - half_log_det + volume - normaliser + begun
+
+    def numbers(self) -> list[int]:
+        """The tree of each observation, in the order in which they came."""
+        return [number for now in self._seen.values() for number, _ in now]
+
+    def _solved(self) -> Solution:
+        """Solve everything from the present estimate, and read pose and trees anew."""
+        numbers = sorted(set(self.numbers()))
+        graph = SceneFactorGraph()
+        observations = LandmarkObservations(self._seen, {n: self.local.state(n) for n in numbers})
+        for k, motion in enumerate(self._motions):
+            graph.advance(float(k))
+            ask_all([MeasuredMotion(*motion, self._poses[k] if k < len(self._poses) else None), observations], graph)
+        solution = graph.solve(_SOLVER)
+        self._poses = np.stack([solution.values.atPose2(pose_key(k)).matrix() for k in range(len(self._motions))])
+        P = solution.covariance([pose_key(len(self._motions) - 1), *map(landmark_key, numbers)])
+        states = {n: (TREE, solution.values.atVector(landmark_key(n))) for n in numbers}
+        self.local = LocalMap(self._poses[-1], P, states)
+        return solution
+
+    def _seen_together(self) -> set[tuple[int, int]]:
+        """Pairs of trees that were seen from one pose."""
+        return {pair for now in self._seen.values() for pair in combinations(sorted({n for n, _ in now}), 2)}
+
+
+def duplicates(local: LocalMap, seen_together: Set[tuple[int, int]]) -> dict[int, int]:
+    """Find trees to merge: number -> the lower number of the same tree; each occurs once.
+
+    seen_together: pairs (lower, higher) of different trees
+    """
+    numbers = sorted(local.kinds)
+    pairs = [(a, b) for a, b in combinations(range(len(numbers)), 2) if (numbers[a], numbers[b]) not in seen_together]
+    if not pairs:
+        return {}
+    i, j = np.array(pairs).T
+    states = np.stack([local.state(number) for number in numbers])
+    P = local.covariance(numbers).reshape(len(numbers), 2, len(numbers), 2)
+    delta = states[j] - states[i]
+    S = P[i, :, i] + P[j, :, j] - P[i, :, j] - P[j, :, i] + _SAME * np.eye(2)
+    possible = np.isfinite(_odds(delta, S))
+    i, j, delta = i[possible], j[possible], delta[possible]
+    half = P[j] - P[i]  # (K, 2, n, 2): covariances of the differences with all trees
+    C = half[:, :, j] - half[:, :, i] + _SAME * np.eye(len(i))[:, None, :, None] * np.eye(2)[:, None]
+    return {numbers[j[k]]: numbers[i[k]] for k in _likeliest_set(np.stack([i, j], axis=1), delta, C)}
+
+
+def _likeliest_set(pairs: IntArray, delta: FloatArray, covariance: FloatArray) -> list[int]:
+    """Rows of the pairs (K, 2) of the likeliest set; delta (K, 2) and their joint covariance (K, 2, K, 2)."""
+    best, chosen, every = 0.0, list[int](), np.arange(len(pairs))
+    single = _odds(delta, covariance[every, :, every])
+    for seed in np.argsort(-single)[:_SEEDS].tolist():
+        total, rows, free, row, won = 0.0, list[int](), every, seed, float(single[seed])
+        mean, C = delta, covariance
+        while won > 0 or not rows:
+            total += won
+            rows.append(row)
+            apart = ~np.isin(pairs[free], pairs[row]).any(axis=1)
+            keep = free[apart]
+            if not len(keep):
+                break
+            at = int(np.flatnonzero(free == row)[0])
+            gain = np.linalg.solve(C[at, :, at], C[at].reshape(2, -1)).T.reshape(len(free), 2, 2)[apart]
+            mean = mean[apart] - gain @ mean[at]
+            C = C[apart][:, :, apart] - np.einsum("kij,jlm->kilm", gain, C[at][:, apart])
+            free, along = keep, np.arange(len(keep))
+            odds = _odds(mean, C[along, :, along])
+            row, won = int(free[np.argmax(odds)]), float(odds.max())
+        if total > best:
+            best, chosen = total, rows
+    return chosen
+
+
+def _odds(delta: FloatArray, S: FloatArray) -> FloatArray:
+    """Log odds (K,) that differences (K, 2) of covariance (K, 2, 2) are none; minus infinity outside the gate."""
+    squared = (delta * np.linalg.solve(S, delta[:, :, None])[:, :, 0]).sum(axis=1)
+    odds = log_odds(squared, np.linalg.slogdet(S)[1], 2, TREE.density)
+    return np.where(squared < gate(_GATE, 2), odds, -np.inf)
+
+
+class Agreement(NamedTuple):
+    """Precision and recall are 1 without pairs in their denominator; F1 = 2 precision recall / (precision + recall)."""
+
+    precision: float
+    recall: float
+    F1: float
+
+
+def pairwise_agreement(estimated: ArrayLike, true: ArrayLike) -> Agreement:
+    """Agreement of two groupings (n,), the group of each observation, over all pairs of observations."""
+    both = np.stack([np.asarray(estimated), np.asarray(true)])
+    common, claimed, actual = (_pairs(table) for table in (both, both[:1], both[1:]))
+    precision, recall = common / claimed if claimed else 1.0, common / actual if actual else 1.0
+    return Agreement(precision, recall, 2 * precision * recall / max(precision + recall, 1e-300))
+
+
+def _pairs(groups: FloatArray) -> float:
+    """Number of pairs of equal columns (k, n)."""
+    counts = np.unique(groups, axis=1, return_counts=True)[1]
+    return float((counts * (counts - 1) // 2).sum())

@@ -1,17 +1,17 @@
-"""LiDAR odometry against KISS-ICP, and what SLAM costs: scan by scan, and with landmarks.
+"""LiDAR odometry against KISS-ICP, and what SLAM costs scan by scan.
 
 Of odometry, each contender places every scan, ours first, theirs next. Three measures:
 
 * the relative error over 10 m against the GPS/IMU poses, which have errors of their own,
-* the mean residual of scans in the map of their neighbours, which needs no reference (`scan_to_map_residual`),
+* the mean residual of scans in the map of the scans around them, which needs no reference: each point q of a scan has k
+  nearest neighbours in that map, with mean c and normal n (direction of the least spread); its residual is
+  | n . (q - c) |. Wrong poses make surfaces thick, which increases residuals. Compare Razlaw et al., Evaluation of
+  registration methods for sparse 3D laser scans, ECMR 2015 (mean plane variance);
 * milliseconds a scan.
 
 "as recorded" gives no times of points, and nobody de-skews; "de-skewed" gives both the times, and each removes the skew
 with his own velocity. KISS-ICP dates a scan at the end of its sweep when it de-skews; its poses are moved back to the
 middle, by its own velocity, before they are compared. Source: Vizzo et al., KISS-ICP, RA-L 2023.
-
-The landmarks are those of a field that the vehicle drives up and down, line beside line, so that those of the line
-before are always seen again; `LandmarkMapper` is not told which one is which.
 """
 
 from __future__ import annotations
@@ -28,30 +28,29 @@ import numpy as np
 import typer
 from scipy.spatial import cKDTree
 
-from benchmarks.agreement import pairwise_agreement
 from benchmarks.course import SimulatedCourse
-from benchmarks.landmark_mapper import LandmarkMapper
-from benchmarks.map_sharpness import scan_to_map_residual
 from benchmarks.runner import Row, Rows, Seed, clocked, each, in_turn, timed
 from benchmarks.scans import ScannerSettings
 from data_tools.datasets.kitti import kitti_scans
-from data_tools.lidar import Scan, ScanSequence, constant_velocity, deskewed
+from data_tools.lidar import Scan, constant_velocity, deskewed, voxel_downsample
+from data_tools.lidar.scan import ScanSequence
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.slam.lidar_slam import LidarSlam
 from pipelines.slam.odometry import LidarOdometry, OdometrySettings
 from pipelines.slam.vehicle_sensors import Vehicle
 from pipelines.tracking import one_thread, peak_memory
 from saga_fg.errors import InputError, MissingExtraError
-from saga_fg.model import PointLandmark
-from saga_fg.numerics import BoolArray, FloatArray, inverse_transform
-from saga_fg.types import Observation
+from saga_fg.numerics.arrays import BoolArray, FloatArray
+from saga_fg.numerics.geometry import inverse_transform, transform_points
 
 OURS, KISS = "saga-fg", "kiss-icp"
 SETTINGS = OdometrySettings()
-APART, LINES, WIDTH = 10.0, 20.0, 200.0  # m between landmarks, between lines, and of the field
-STEP, REACH = 2.0, 20.0  # m
-MOTION, NOISE = np.array([0.03, 0.02, 0.002]), 0.1  # standard deviations of a motion (m, m, rad), of places, m
 EVERY = 50  # scans from one measurement of the machine's load to the next
+NEIGHBOURS = 8
+SPACING = 0.2  # m, of the map's points
+THINNED = 0.5  # m, of the scan's
+NEAREST_WITHIN = 0.5  # m; points without a neighbour this near are new and left out
+FARTHEST = 50.0  # m from the sensor: beyond, rings are too far apart for planes
 
 Place = Callable[[Scan, float], FloatArray]
 
@@ -72,10 +71,6 @@ def slam(
     firings: Annotated[
         int, typer.Option("--columns", min=100, help="With --dense: points of a beam; 2000 are full density.")
     ] = 2000,
-    landmarks: Annotated[
-        int | None,
-        typer.Option("--landmarks", min=20, help="Instead: cost of `LandmarkMapper` up to so many landmarks."),
-    ] = None,
     seed: Seed = 0,
 ) -> Rows:
     """LiDAR odometry against KISS-ICP, on the same scans in turn.
@@ -88,10 +83,9 @@ def slam(
     Examples:
       python -m benchmarks slam --dataroot data/kitti --sequence 0000
       python -m benchmarks slam --dense 40
-      python -m benchmarks slam --landmarks 3000
     """
-    if sum(one is not None for one in (dataroot, landmarks, dense)) != 1:
-        raise InputError("expected one of --dataroot, --landmarks and --dense")
+    if (dataroot is None) == (dense is None):
+        raise InputError("expected one of --dataroot and --dense")
     if dataroot is not None:
         recorded = kitti_scans(dataroot, sequence, most=scans)
         yield from odometry_rows(recorded, kiss)
@@ -99,8 +93,6 @@ def slam(
     elif dense is not None:
         course = SimulatedCourse(seed, 0.8 * dense, settings=ScannerSettings(rings=64, columns=firings))
         yield from all_in_rows(course, course.lap)
-    else:
-        yield from landmark_rows(landmarks or 0, seed)
 
 
 def odometry_rows(scans: ScanSequence, kiss: bool = True) -> Iterator[Row]:
@@ -180,6 +172,45 @@ def still_clouds(scans: ScanSequence, map_T_lidar: FloatArray, skewed: bool) -> 
     return clouds
 
 
+def scan_to_map_residual(
+    clouds: Sequence[FloatArray], world_T_lidar: FloatArray, around: int = 10, every: int = 5
+) -> float:
+    """Mean residual, m, of every fifth scan in the map of the ten before it and the ten after it; NaN for one scan.
+
+    clouds         K scans without skew, points (N, 3) in the sensor's frame; asked for when they are needed
+    world_T_lidar  (K, 4, 4)
+    """
+    residuals, thin = [np.empty(0)], dict[int, FloatArray]()
+    for k in range(0, len(clouds), every):
+        near = range(max(0, k - around), min(len(clouds), k + around + 1))
+        thin = {j: thin[j] if j in thin else _thinned(clouds[j]) for j in near}
+        others = [j for j in near if j != k]
+        if others:
+            map_points = np.concatenate([transform_points(world_T_lidar[j], thin[j]) for j in others])
+            residuals.append(_residuals(thin[k], map_points, world_T_lidar[k]))
+    found = np.concatenate(residuals)
+    return float(found.mean()) if len(found) else float("nan")
+
+
+def _thinned(cloud: FloatArray) -> FloatArray:
+    return cloud[voxel_downsample(cloud, SPACING)]
+
+
+def _residuals(scan: FloatArray, map_points: FloatArray, world_T_lidar: FloatArray) -> FloatArray:
+    scan = scan[np.linalg.norm(scan, axis=1) <= FARTHEST]
+    points = transform_points(world_T_lidar, scan[voxel_downsample(scan, THINNED)])
+    map_points = map_points[voxel_downsample(map_points, SPACING)]
+    if len(map_points) < NEIGHBOURS:
+        return np.empty(0)
+    distance, row = cKDTree(map_points).query(points, k=NEIGHBOURS)
+    near = distance[:, 0] <= NEAREST_WITHIN
+    around = map_points[row[near]]
+    mean = around.mean(axis=1)
+    off = around - mean[:, None]
+    normal = np.linalg.eigh(off.swapaxes(1, 2) @ off)[1][:, :, 0]
+    return np.asarray(np.abs(np.einsum("ni,ni->n", points[near] - mean, normal)))
+
+
 def _poses(scans: ScanSequence) -> FloatArray:
     """world_T_ego (K, 4, 4) of scans that have them."""
     assert scans.world_T_ego is not None
@@ -242,53 +273,3 @@ def _load(scans: ScanSequence) -> float:
 def _mean(values: FloatArray | Sequence[float]) -> float:
     known = np.asarray(values)[np.isfinite(values)]
     return float(known.mean()) if len(known) else float("nan")
-
-
-def landmark_rows(landmarks: int, seed: int) -> Iterator[Row]:
-    """Tenths of a drive, and its last one by the second: at the start no line has another beside it."""
-    rng = np.random.default_rng(seed)
-    across = int(WIDTH / APART)
-    grid = np.stack([np.arange(landmarks) % across, np.arange(landmarks) // across], axis=1)
-    places = APART * grid + rng.uniform(-3.0, 3.0, (landmarks, 2))
-    poses = _lines(APART * float(grid[:, 1].max()))
-    tree, kind, Q = cKDTree(places), PointLandmark(density=1 / APART**2), np.diag(MOTION**2)
-    mapper, cost = LandmarkMapper(poses[0].matrix(), 1e-6 * np.eye(3)), np.zeros(len(poses))
-    sizes, true = np.zeros((len(poses), 2), dtype=int), list[int]()
-    with one_thread():
-        for k in each(range(len(poses)), "landmarks"):
-            near = np.sort(np.array(tree.query_ball_point(poses[k].translation(), REACH), dtype=np.int64))
-            seen = [poses[k].transformTo(places[n]) for n in near]
-            ahead = [row for row, place in enumerate(seen) if place[0] > 0]
-            R = NOISE**2 * np.eye(2)
-            observations = [Observation(kind, seen[row] + NOISE * rng.normal(size=2), R) for row in ahead]
-            if k:
-                noise = MOTION * rng.normal(size=3)
-                cost[k] = timed(mapper.move, poses[k - 1].between(poses[k]).retract(noise).matrix(), Q)
-            cost[k] += timed(mapper.observe, observations)
-            true += near[ahead].tolist()
-            sizes[k] = len(mapper.landmarks), len(mapper.local.kinds)
-        done = mapper.map()
-    edges = np.linspace(0, len(poses), 11).astype(int).tolist()
-    for a, b in pairwise(edges):
-        counts = {"landmarks of the map": sizes[b - 1, 0], "in the local Gaussian": sizes[b - 1, 1]}
-        yield "tenths of the drive", {"poses": f"{a} to {b}", "ms a pose": cost[a:b].mean(), **counts}
-    off = done.world_T_pose[:, :2, 2] - np.array([pose.translation() for pose in poses])
-    f1 = pairwise_agreement([one.landmark for one in done.observations], true).f1
-    about = {"poses": len(poses), "observations": len(true), "landmarks": len(done.landmarks), "F1 over pairs": f1}
-    ratio = cost[edges[-2] :].mean() / cost[edges[1] : edges[2]].mean()
-    growth = {"time, last tenth / second": ratio, "landmarks, likewise": sizes[-1, 0] / sizes[edges[2] - 1, 0]}
-    error = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
-    yield "the whole drive", {**about, **growth, "error, m": error, "MB": peak_memory()}
-
-
-def _lines(length: float) -> list[gtsam.Pose2]:
-    """Poses along lines across the field, up and down, over its length."""
-    corners: list[FloatArray] = []
-    for line in range(int(length / LINES) + 1):
-        corners += list(np.array([[0.0, WIDTH][:: 1 if line % 2 == 0 else -1], [line * LINES] * 2]).T)
-    poses = []
-    for a, b in pairwise(corners):
-        count = max(1, round(float(np.linalg.norm(b - a)) / STEP))
-        heading = float(np.arctan2(*(b - a)[::-1]))
-        poses += [gtsam.Pose2(heading, a + (b - a) * k / count) for k in range(count)]
-    return poses

@@ -25,7 +25,8 @@ from pipelines.slam.results import planar_trajectory
 from saga_fg.errors import InputError
 from saga_fg.estimators import BatchSolver
 from saga_fg.graph import EGO_ERROR, LANDMARK, Additions, GraphView, NewVariable, SceneFactorGraph, ask_all, key_of
-from saga_fg.numerics import FloatArray, inverse_transform, transform_points
+from saga_fg.numerics.arrays import FloatArray
+from saga_fg.numerics.geometry import transform_points
 from saga_fg.slam.mapping import MeasuredMotion, landmark_key, pose_key
 
 _SOLVER = SolverSettings(tolerance=1e-2, max_iterations=50)
@@ -132,27 +133,27 @@ def _range_factors(rows: list[list[int]], z: FloatArray, variance: float) -> Res
     return ResidualFactors(keys, (PlanarPose(), 2, 2), residual, variance * np.eye(1), jacobians, _LOSS, name="ranges")
 
 
-def compared(drive: LandmarkLog, found: BeaconMap) -> tuple[dict[str, float], dict[str, FloatArray]]:
-    """Figures against the truth where there is one, and the true path (n, 3) in the coordinates of the estimate.
+def compared(drive: LandmarkLog, found: BeaconMap) -> dict[str, float]:
+    """Figures against the truth where there is one.
 
     The estimate is moved as a whole to lie nearest to the true path; beacons are compared after the same motion. The
     true heading has no part in it: its zero is not that of the direction of travel in every recording.
     """
     figures = {"scale": found.scale, "offset, m": found.offset}
     if drive.truth is None:
-        return figures, {}
+        return figures
     tolerance = float(np.diff(drive.time).max(initial=0.01))
     estimate, truth = matched(planar_trajectory(drive.time, found.world_T_pose), drive.truth, tolerance)
     reckoned, _ = matched(planar_trajectory(drive.time, found.dead_reckoning), drive.truth, tolerance)
     figures["ATE, m"] = _root_mean_square(absolute_errors(estimate, truth))
     figures["ATE of dead reckoning, m"] = _root_mean_square(absolute_errors(reckoned, truth))
-    truth_T_world = rigid_alignment(estimate.positions, truth.positions)
     known = [number for number in found.beacons if number in drive.places]
     if known:
+        truth_T_world = rigid_alignment(estimate.positions, truth.positions)
         places = np.array([[*found.beacons[number], 0.0] for number in known])
         off = transform_points(truth_T_world, places)[:, :2] - np.array([drive.places[number] for number in known])
         figures["beacons, m"] = _root_mean_square(np.linalg.norm(off, axis=1))
-    return figures, {"truth": transform_points(inverse_transform(truth_T_world), truth.positions)}
+    return figures
 
 
 def _root_mean_square(errors: FloatArray) -> float:

@@ -12,8 +12,18 @@ from benchmarks import joint as module
 from benchmarks.app import app
 from benchmarks.course import SimulatedCourse
 from benchmarks.joint import batch_run, degraded_drive, degraded_odometry, joint_rows, online_run, street
-from benchmarks.scans import SENSOR_HEIGHT, ScannerSettings, SimulatedScans, StaticWorld, ranges, simulate_scan
-from benchmarks.slam import odometry_rows
+from benchmarks.scans import (
+    SENSOR_HEIGHT,
+    ScannerSettings,
+    SimulatedScans,
+    StaticWorld,
+    drive,
+    ranges,
+    scans,
+    simulate_scan,
+)
+from benchmarks.scans import street as world_of
+from benchmarks.slam import odometry_rows, scan_to_map_residual
 from data_tools.datasets.kitti import kitti_scans
 from data_tools.lidar import deskewed
 from data_tools.pose_graphs import write_g2o
@@ -150,7 +160,7 @@ def test_errors_have_the_deviations_of_the_model():
 def test_options_go_together_and_one_thing_is_asked_for_at_a_time(refused):
     assert "expected both --dataroot and --detections" in refused("joint --dataroot somewhere")
     assert "--online: expected without --poles" in refused("joint --online --poles")
-    assert "expected one of --dataroot, --landmarks and --dense" in refused("slam --landmarks 120 --dense 3")
+    assert "expected one of --dataroot and --dense" in refused("slam --dataroot somewhere --dense 3")
 
 
 def test_the_command_prints_the_changes(bench, monkeypatch):
@@ -206,7 +216,7 @@ def test_a_lap_closes_scans_repeat_and_cars_leave_and_come():
     assert after < len(town.world.boxes)
 
 
-# `python -m benchmarks slam`: odometry beside KISS-ICP, cost of scans all in, and of landmarks
+# `python -m benchmarks slam`: odometry beside KISS-ICP, cost of scans all in
 
 
 def test_both_are_measured_on_the_same_scans():
@@ -230,8 +240,11 @@ def test_the_command_on_recorded_scans(bench, recordings):
     assert any(row["table"] == "SLAM all in, CPU time" for row in rows)
 
 
-def test_a_map_of_landmarks_is_measured_while_it_grows(bench):
-    *parts, whole = bench("slam --landmarks 60")
-    assert whole["landmarks"] == parts[-1]["landmarks of the map"] == 60
-    assert whole["F1 over pairs"] == 1.0
-    assert max(part["in the local Gaussian"] for part in parts) < 45
+def test_wrong_poses_make_a_duller_map():
+    poses = drive(12, speed=4.0)
+    clouds = [scan.points for scan in scans(world_of(1), poses, skewed=False)]
+    wrong = poses @ np.array([yaw_transform(z=0.05 * (-1) ** k) for k in range(len(poses))])
+    assert scan_to_map_residual(clouds, poses) < 0.7 * scan_to_map_residual(clouds, wrong)
+    assert np.isnan(scan_to_map_residual(clouds[:1], poses[:1]))
+    moved = yaw_transform(100.0, 50.0, 3.0, 1.0) @ poses
+    assert scan_to_map_residual(clouds, moved) == pytest.approx(scan_to_map_residual(clouds, poses), rel=0.1)

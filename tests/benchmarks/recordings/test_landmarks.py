@@ -1,23 +1,21 @@
-"""Recordings of landmarks."""
+"""Recordings of landmarks, and maps of them."""
 
-import json
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from typer.testing import CliRunner, Result
 
-from benchmarks.agreement import pairwise_agreement
-from benchmarks.app import app
+from benchmarks import landmarks as module
+from benchmarks.landmarks import START, TREE, TreeMapper, duplicates, pairwise_agreement
 from benchmarks.recordings.landmarks import read_landmark_log
-from data_tools.trajectories import read_kitti_poses, read_tum_poses
 from saga_fg import InputError
+from saga_fg.slam.mapping import LocalMap
+from saga_fg.types.frame import Observation
 
-
-def landmarks(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, ["landmarks", *map(str, arguments)], catch_exceptions=False)
+R = 0.05**2 * np.eye(2)
 
 
 def rounds(poses: int, rounds: float, radius: float) -> tuple[np.ndarray, float, float]:
@@ -50,20 +48,68 @@ def park(folder: Path, seed: int = 0) -> tuple[Path, int]:
     return path, len(seen)
 
 
-def test_trees_are_told_apart_without_their_names(tmp_path):
+def test_trees_are_told_apart_without_their_names(bench, tmp_path):
     path, trees = park(tmp_path)
-    output = tmp_path / "out"
-    result = landmarks(path, "--output", output)
-    assert result.exit_code == 0
-    figures = json.loads((output / "figures.json").read_text())
-    assert figures["pairwise F1"] > 0.95
-    evidence = {float(scale): value for scale, value in figures["log evidence by odometry scale"].items()}
-    assert figures["odometry scale"] == max(evidence, key=lambda scale: evidence[scale]) < 256
-    found = json.loads((output / "landmarks.json").read_text())
-    assert abs(sum(landmark["observations"] > 2 for landmark in found) - trees) <= 1
-    assert all(np.linalg.eigvalsh(landmark["covariance"])[0] > 0 for landmark in found)
-    assert len(read_tum_poses(output / "trajectory.tum")) == len(read_kitti_poses(output / "trajectory.kitti")) == 240
-    assert (output / "above.png").read_bytes().startswith(b"\x89PNG")
+    evidence, found = bench(f"landmarks {path}")
+    assert found["pairwise F1"] > 0.95
+    assert abs(found["trees"] - trees) <= 1
+    tried = {float(scale): value for scale, value in evidence.items() if scale != "table"}
+    assert found["odometry scale"] == max(tried, key=lambda scale: tried[scale]) < 256
+
+
+def test_duplicates_are_merged_along_the_whole_drive_that_led_to_them(monkeypatch):
+    """Round a block with a drift that odometry tells, past the first trees again before the loop is found."""
+    monkeypatch.setattr(module, "SMOOTH_EVERY", 60)
+    rng, mapper = np.random.default_rng(0), TreeMapper()
+    angle = 2 * np.pi * np.arange(24) / 24
+    trees = np.stack([36 * np.sin(angle), 30 - 36 * np.cos(angle)], axis=1) + rng.uniform(-1.5, 1.5, (24, 2))
+    pose, step, sigma, true = gtsam.Pose2(), gtsam.Pose2(np.pi, 0.0, np.pi / 30), np.array([0.1, 0.1, 0.03]), []
+    for _ in range(84):
+        local = np.array([pose.transformTo(tree) for tree in trees])
+        rows = np.flatnonzero((np.hypot(*local.T) < 18) & (local[:, 0] > 0))
+        mapper.observe([Observation(TREE, local[row] + rng.normal(0, 0.05, 2), R) for row in rows])
+        true += rows.tolist()
+        mapper.move(step.retract(sigma * rng.normal(size=3)).matrix(), np.diag(sigma**2))
+        pose = pose.compose(step)
+    begun = len(mapper.local.kinds)
+    mapper.smooth()
+    assert len(set(zip(mapper.numbers(), true, strict=True))) == len(mapper.local.kinds) == len(set(true)) == 24
+    assert begun > 24
+
+
+def test_the_filter_is_the_smoother_where_everything_is_linear():
+    """A straight drive past points, without turns: joint filter and global solution agree."""
+    rng, mapper = np.random.default_rng(0), TreeMapper()
+    trees = np.array([[3.0, 4.0], [8.0, -5.0], [15.0, 3.0]])
+    for k in range(8):
+        seen = trees - [k, 0] + 0.05 * rng.normal(size=trees.shape)
+        mapper.observe([Observation(TREE, z, 0.01 * np.eye(2)) for z in seen])
+        mapper.move(gtsam.Pose2(1.0, 0.0, 0.0).matrix(), np.diag([1e-3, 1e-3, 1e-12]))
+    filtered = mapper.local
+    mapper.smooth()
+    for number in (1, 2, 3):
+        np.testing.assert_allclose(mapper.local.state(number), filtered.state(number), atol=1e-4)
+    np.testing.assert_allclose(mapper.local.covariance([1, 2, 3]), filtered.covariance([1, 2, 3]), rtol=1e-2, atol=1e-6)
+
+
+def revisited(shift: tuple[float, float], drift: float, count: int) -> LocalMap:
+    """Trees 1 ... count, and begun anew after a drift of unknown direction, `shift` in truth."""
+    places = np.array([[5.0, 5.0], [12.0, -4.0], [20.0, 6.0], [26.0, -7.0]])[:count]
+    local = LocalMap(np.eye(3), START)
+    for number, place in enumerate(places, start=1):
+        local.augment(number, Observation(TREE, place, 0.01 * np.eye(2)))
+    local.predict(np.eye(3), np.diag([drift**2, drift**2, 1e-8]))
+    for number, place in enumerate(places + shift, start=count + 1):
+        local.augment(number, Observation(TREE, place, 0.01 * np.eye(2)))
+    return local
+
+
+def test_constellations_are_recognised_and_what_was_seen_side_by_side_is_never_one():
+    assert duplicates(revisited((4.0, 3.0), 5.0, 1), set()) == {}
+    assert duplicates(revisited((4.0, 3.0), 5.0, 4), set()) == {5: 1, 6: 2, 7: 3, 8: 4}
+    local = revisited((0.1, 0.0), 0.2, 2)
+    assert duplicates(local, set()) == {3: 1, 4: 2}
+    assert duplicates(local, {(1, 3)}) == {4: 2}
 
 
 def beacons(folder: Path) -> Path:
@@ -94,24 +140,17 @@ def beacons(folder: Path) -> Path:
     return folder / "B_DR.txt"
 
 
-def test_beacons_are_found_by_ranges_alone(tmp_path):
-    output = tmp_path / "out"
-    result = landmarks(beacons(tmp_path), "--output", output)
-    assert result.exit_code == 0
-    assert "ATE, m" in result.stdout
-    figures = json.loads((output / "figures.json").read_text())
+def test_beacons_are_found_by_ranges_alone(bench, tmp_path):
+    (figures,) = bench(f"landmarks {beacons(tmp_path)}")
     assert figures["ATE, m"] < 0.5
     assert figures["ATE, m"] < 0.5 * figures["ATE of dead reckoning, m"]
     assert figures["beacons, m"] < 0.5
     assert figures["scale"] == pytest.approx(0.07, abs=0.02)
-    assert {landmark["number"] for landmark in json.loads((output / "landmarks.json").read_text())} == {1, 4, 6}
 
 
-def test_a_scale_that_is_none_is_refused(tmp_path):
+def test_a_scale_that_is_none_is_refused(refused, tmp_path):
     path, _ = park(tmp_path)
-    result = landmarks(path, "--output", tmp_path / "out", "--odometry-scale", "0")
-    assert result.exit_code == 2
-    assert "--odometry-scale 0: expected a number > 0" in result.stderr
+    assert "--odometry-scale 0: expected a number > 0" in refused(f"landmarks {path} --odometry-scale 0")
 
 
 # Victoria Park and Plaza: what the files say, and what is said of broken ones
@@ -210,7 +249,7 @@ def test_an_example_by_hand():
     assert found.precision == pytest.approx(2 / 4)
     assert found.recall == pytest.approx(2 / 4)
     assert pairwise_agreement([1, 2, 3], [1, 1, 1]).recall == 0
-    assert pairwise_agreement([], []).f1 == 1
+    assert pairwise_agreement([], []).F1 == 1
 
 
 @given(GROUPS)
@@ -221,4 +260,4 @@ def test_it_counts_pairs(groups):
     found = pairwise_agreement(a, b)
     assert found.precision == pytest.approx((one & other).sum() / one.sum() if one.any() else 1)
     assert found.recall == pytest.approx((one & other).sum() / other.sum() if other.any() else 1)
-    assert pairwise_agreement(a, a + 100).f1 == 1
+    assert pairwise_agreement(a, a + 100).F1 == 1

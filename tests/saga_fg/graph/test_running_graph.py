@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from tests.saga_fg.sampled_traffic import DetectionProvider, ObjectProvider, VehicleProvider, providers, sample_traffic
 from factors import ResidualFactors, Robust, SolverSettings, prior_factor
 from saga_fg import ConstantVelocity, NodeType, SceneGraph
 from saga_fg.conformance.programs import (
@@ -35,6 +34,7 @@ from saga_fg.model.discretisation import discretise
 from saga_fg.model.nonlinear_interactions import Accelerations
 from saga_fg.model.scene_graph import NonlinearEdges
 from tests.saga_fg.graph_estimator import GraphEstimator
+from tests.saga_fg.sampled_traffic import DetectionProvider, ObjectProvider, VehicleProvider, providers, sample_traffic
 
 USUAL = (0.02, 0.1, 0.37, 0.5, 1.2)
 MILLISECONDS = (1e-3, 0.05, 1.0)

@@ -9,7 +9,6 @@ import gtsam
 import numpy as np
 import pytest
 
-from tests.saga_fg.sampled_traffic import providers, sample_traffic
 from factors import (
     SolverSettings,
     Vector,
@@ -43,6 +42,7 @@ from saga_fg.graph import (
 )
 from saga_fg.graph.variables import KINDS, LARGEST, described
 from saga_fg.model.discretisation import discretise
+from tests.saga_fg.sampled_traffic import providers, sample_traffic
 
 
 class Once:

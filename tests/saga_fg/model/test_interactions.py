@@ -8,7 +8,6 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from tests.saga_fg.sampled_traffic import Interaction
 from factors import Vector
 from factors.manifolds import central_differences
 from saga_fg import InputError
@@ -31,6 +30,7 @@ from saga_fg.model.nonlinear_interactions import (
 from saga_fg.model.stability import require_stable
 from saga_fg.numerics.geometry import yaw_transform
 from tests.saga_fg.road_scenes import queue, table
+from tests.saga_fg.sampled_traffic import Interaction
 
 seeds = st.integers(0, 2**32 - 1)
 pairs_of_types = st.tuples(st.sampled_from(MOVING), st.sampled_from(MOVING))

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.saga_fg.sampled_traffic import providers, sample_traffic
 from factors import ResidualFactors
 from saga_fg import Detection, Detections, Frame, Sensor, Tracker, TrackerSettings, Tracks
 from saga_fg.estimators import IncrementalSmoother
@@ -23,6 +22,7 @@ from saga_fg.tracking import AssociationSettings, ClassSettings, Journal
 from saga_fg.tracking.edge_record import ACCELERATION, MAX_RATIO, EdgeRecord
 from saga_fg.tracking.halting_places import HaltingPlaces
 from saga_fg.tracking.journal import GraphRecord, TrackerView
+from tests.saga_fg.sampled_traffic import providers, sample_traffic
 from tests.saga_fg.traffic_frames import columns, seen
 from tests.saga_fg.traffic_frames import frame as edge_frame
 from tests.saga_fg.traffic_frames import run as edge_run
