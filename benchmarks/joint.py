@@ -62,35 +62,15 @@ State = tuple[IntArray, FloatArray, FloatArray, Assignment]  # ids, states (n, 4
 At = Callable[[int, Frame, Detections], Mapping[str, State]]
 
 
-@dataclass(frozen=True)
-class KittiOptions:
-    """Recordings of KITTI."""
-
+def joint(
     dataroot: Annotated[
         Path | None, typer.Option("--dataroot", help="KITTI tracking; without it, simulated streets.")
-    ] = None
+    ] = None,
     detections: Annotated[
         Path | None, typer.Option("--detections", help="Folder of a detector: Car/, Pedestrian/, Cyclist/.")
-    ] = None
-    scenes: Annotated[str | None, typer.Option("--scenes", help="KITTI sequences, by commas; all.")] = None
-
-
-@dataclass(frozen=True)
-class StreetOptions:
-    """Simulated streets."""
-
-    scenes: Annotated[int, typer.Option("--scenes", min=2, help="Simulated scenes.")] = 10
-    first: Annotated[int, typer.Option("--first", min=0, help="Seed of the first simulated scene.")] = 0
-    poles: Annotated[bool, typer.Option("--poles", help="Simulated: once more with poles beside the road.")] = False
-    parked: Annotated[
-        bool, typer.Option("--parked/--no-parked", help="Simulated: cars parked on both sides, or none.")
-    ] = True
-
-
-def joint(
-    *,
-    kitti: KittiOptions,
-    streets: StreetOptions,
+    ] = None,
+    scenes: Annotated[int, typer.Option("--scenes", min=2, help="Simulated scenes.")] = 10,
+    poles: Annotated[bool, typer.Option("--poles", help="Simulated: once more with poles beside the road.")] = False,
     seeds: Annotated[int, typer.Option("--seeds", min=1, help="Samples of the odometry's errors per recording.")] = 1,
     online: Annotated[bool, typer.Option("--online", help="In a running graph, frame by frame.")] = False,
     lag: Annotated[float, typer.Option("--lag", min=0.0, help="Of the running graph, s.")] = 3.0,
@@ -107,24 +87,17 @@ def joint(
       python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --seeds 10
       python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --online
     """
-    if (kitti.dataroot is None) != (kitti.detections is None):
+    if (dataroot is None) != (detections is None):
         raise InputError("expected both --dataroot and --detections, or neither")
-    if kitti.dataroot is not None and (streets.poles or not streets.parked):
-        raise InputError("--poles and --no-parked: expected with simulated streets only")
-    if online and streets.poles:
-        raise InputError("--online: expected without --poles")
-    if kitti.dataroot is None:
-        many = [
-            simulate_scene(street(streets.parked), seed)
-            for seed in range(streets.first, streets.first + streets.scenes)
-        ]
+    if poles and (online or dataroot is not None):
+        raise InputError("--poles: expected without --online, with simulated streets only")
+    if dataroot is None:
+        many = [simulate_scene(street(), seed) for seed in range(scenes)]
     else:
-        found = KittiTracking(
-            kitti.dataroot, kitti.detections, None if kitti.scenes is None else kitti.scenes.split(","), True
-        )
+        found = KittiTracking(dataroot, detections, None, True)
         many = [found.scene(name) for name in found.scenes]
-    base = load_config("simulated" if kitti.dataroot is None else "kitti", config)
-    run = partial(online_run, lag=lag) if online else partial(batch_run, poles=streets.poles)
+    base = load_config("simulated" if dataroot is None else "kitti", config)
+    run = partial(online_run, lag=lag) if online else partial(batch_run, poles=poles)
     yield from joint_rows(many, range(seeds), partial(run, config=base, settings=JointSettings()))
 
 
@@ -175,9 +148,9 @@ def joint_rows(scenes: Sequence[Scene], seeds: Sequence[int], run: Callable[...,
             yield "changes of pooled errors of objects", {**about, **changes}
 
 
-def street(parked: bool = True, duration: float = 20.0) -> SimulatorSettings:
-    """Simulated scenes with cars parked on both sides of the road, or on none."""
-    return SimulatorSettings(parking_probability=1.0 if parked else 0.0, duration=duration)
+def street(duration: float = 20.0) -> SimulatorSettings:
+    """Simulated scenes with cars parked on both sides of the road."""
+    return SimulatorSettings(parking_probability=1.0, duration=duration)
 
 
 def degraded_drive(

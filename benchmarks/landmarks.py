@@ -118,7 +118,8 @@ class TreeMapper:
         self._motions = [(np.eye(3), START)]
         self._seen: dict[int, list[tuple[int, Observation]]] = {}  # by pose, each with the number of its tree
         self._poses = np.empty((0, 3, 3))  # at the last solution
-        self._numbers = self._since = 0
+        self.begun = 0  # trees, those merged later among them
+        self._since = 0
 
     def move(self, a_T_b: FloatArray, covariance: FloatArray) -> None:
         """Go on to the next pose by odometry: a_T_b (3, 3), covariance (3, 3) of its tangent."""
@@ -133,9 +134,9 @@ class TreeMapper:
         now = self._seen.setdefault(len(self._motions) - 1, []) if observations else []
         for row, observation in enumerate(observations):
             if row not in pairs:
-                self._numbers += 1
-                self.local.augment(self._numbers, observation)
-            now.append((pairs[row].landmark if row in pairs else self._numbers, observation))
+                self.begun += 1
+                self.local.augment(self.begun, observation)
+            now.append((pairs[row].landmark if row in pairs else self.begun, observation))
         self._since += len(observations)
         if self._since >= SMOOTH_EVERY:
             self.smooth()

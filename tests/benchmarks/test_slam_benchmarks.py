@@ -159,12 +159,12 @@ def test_errors_have_the_deviations_of_the_model():
 
 def test_options_go_together_and_one_thing_is_asked_for_at_a_time(refused):
     assert "expected both --dataroot and --detections" in refused("joint --dataroot somewhere")
-    assert "--online: expected without --poles" in refused("joint --online --poles")
+    assert "--poles: expected without --online" in refused("joint --online --poles")
     assert "expected one of --dataroot and --dense" in refused("slam --dataroot somewhere --dense 3")
 
 
 def test_the_command_prints_the_changes(bench, monkeypatch):
-    monkeypatch.setattr(module, "street", lambda parked: SHORT)
+    monkeypatch.setattr(module, "street", lambda: SHORT)
     compared = {row.get("compared") for row in bench("joint --scenes 2")}
     assert {"joint against decoupled", "joint against held"} <= compared
 
