@@ -146,6 +146,10 @@ class SceneBoxes(Columns):
         bounds = np.searchsorted(self.frame, np.arange(count + 1)).tolist()
         return [self.select(slice(first, end)) for first, end in pairwise(bounds)]
 
+    def annotations(self, count: int) -> list[Annotations]:
+        """The boxes of each of `count` frames as objects that can be seen, to compare others with them."""
+        return [Annotations(each.id, each.boxes, np.ones(len(each), dtype=np.bool_)) for each in self.by_frame(count)]
+
 
 FrameBoxes = tuple[IntArray, Boxes]  # index of the frame (N,), and N boxes
 Pairs = tuple[IntArray, IntArray, FloatArray]  # rows (P,) of the first and of the second table, distance (P,) in m

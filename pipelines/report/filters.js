@@ -1,7 +1,7 @@
 // The rows that are shown, and the controls that choose them: classes, scores, confirmed, ghosts.
 const CONFIRMED = 3;  // moments at which a track was detected
 
-function makeFilters(scenes, thresholds, ghosts, changed) {
+function makeFilters(scenes, thresholds, ghosts, changed, chosen) {  // chosen: one class alone, or all again
   const state = {confirmed: true, ghosts, byTrack: false, off: new Set(), thresholds: {...thresholds}};
   const counted = new Map(), classColour = label => colourOf[label] ?? SOFT;  // a correction may bring a new class
 
@@ -33,7 +33,7 @@ function makeFilters(scenes, thresholds, ghosts, changed) {
       chip.type = "button"; chip.className = "chip"; chip.textContent = label; chip.dataset.label = label;
       chip.style.setProperty("--colour", classColour(label));
       chip.setAttribute("aria-pressed", String(!state.off.has(label)));
-      chip.title = "click: on and off; double click: this one alone";
+      chip.title = "click: on and off; double click: this one alone, as near as it fits";
       const press = () => {
         for (const each of $("classes").children) each.setAttribute("aria-pressed", String(!state.off.has(each.dataset.label)));
         changed();
@@ -42,7 +42,7 @@ function makeFilters(scenes, thresholds, ghosts, changed) {
       chip.ondblclick = () => {
         const others = [...$("classes").children].map(each => each.dataset.label).filter(each => each !== label);
         const alone = others.every(each => state.off.has(each));
-        state.off = new Set(alone ? [] : others); press();
+        state.off = new Set(alone ? [] : others); press(); chosen();
       };
       return chip;
     }));

@@ -1,19 +1,20 @@
 // Layers of the view, from below to above. Each draws one thing of a moment:
-//   view  {g, thin: m of a pixel, scene, k, result: tracks of a method, tracks: rows shown, focus: row followed, colour(row)}
+//   view  {g, thin: m of a pixel, step: m between lines of the grid, scene, k, result: tracks of a method, tracks: rows shown, focus: row followed, colour(row)}
 // A layer that is off still draws what concerns the followed track (`focused`).
 const ID = 0, LABEL = 1, X = 2, Y = 3, LENGTH = 4, WIDTH = 5, YAW = 6, VX = 7, VY = 8, SCORE = 9, XX = 10, XY = 11, YY = 12, COASTING = 13;
 const ELLIPSE_95 = 5.991, TRAIL = 3;  // chi-square with 2 degrees of freedom; s
 let unseenFrom;  // ms since the last detection, from which a track coasts
-const SOFT = "#5c6b7a";
+const SOFT = "#5c6b7a", NAMED = 60;  // pixels of a relation, from which its name has room
 
 const LAYERS = [
+  {name: "grid", on: true, draw: drawGrid},
   {name: "map", on: true, there: scene => scene.map, draw: drawMap},
   {name: "road", on: true, there: scene => scene.road, draw: ({g, scene, k, thin}) => drawRoad(g, scene.road, k, thin)},
   {name: "truth", text: "true objects", on: true, there: scene => scene.truth, draw: drawTruth},
   {name: "vehicle", on: true, there: moves, draw: drawVehicle},
   {name: "detections", on: false, there: scene => scene.detections.some(rows => rows.length), draw: drawDetections, focused: true},
   {name: "trails", on: true, draw: drawTrails},
-  {name: "edges", on: false, there: scene => Object.values(scene.methods).some(m => m.edges.some(rows => rows.length)), draw: drawEdges, focused: true},
+  {name: "edges", text: "relations", on: false, there: scene => Object.values(scene.methods).some(m => m.edges.some(rows => rows.length)), draw: drawEdges, focused: true},
   {name: "fans", text: "predictions", on: true, there: scene => Object.values(scene.methods).some(m => m.horizons.length), draw: drawFans, focused: true},
   {name: "ellipses", on: false, draw: drawEllipses, focused: true},
   {name: "tracks", on: true, draw: drawTracks},
@@ -23,6 +24,19 @@ const LAYERS = [
 function moves(scene) { return scene.ego.some(pose => pose.some((v, i) => v !== scene.ego[0][i])); }
 
 const middle = row => [row[X] / 100, row[Y] / 100];
+
+function drawGrid({g, scene, step, thin}) {  // at round coordinates of the world
+  const ratio = window.devicePixelRatio || 1, inverse = g.getTransform().inverse(), {clientWidth, clientHeight} = g.canvas;
+  const corners = [[0, 0], [1, 0], [0, 1], [1, 1]].map(([a, b]) => inverse.transformPoint(new DOMPoint(a * clientWidth * ratio, b * clientHeight * ratio)));
+  g.strokeStyle = "#e6ebf0"; g.lineWidth = thin; g.beginPath();
+  const spans = ["x", "y"].map(axis => [Math.min(...corners.map(p => p[axis])), Math.max(...corners.map(p => p[axis]))]);
+  for (const axis of [0, 1]) {
+    const [low, high] = spans[axis], [from, to] = spans[1 - axis], shift = scene.origin[axis];
+    for (let at = Math.ceil((low + shift) / step) * step - shift; at < high; at += step)
+      axis ? (g.moveTo(from, at), g.lineTo(to, at)) : (g.moveTo(at, from), g.lineTo(at, to));
+  }
+  g.stroke();
+}
 
 function outline(g, x, y, length, width, yaw) {
   const c = Math.cos(yaw), s = Math.sin(yaw);
@@ -88,11 +102,11 @@ function drawTrails(view) {
   }
 }
 
-function drawEdges({g, k, result, tracks, thin, focus, on}) {
-  const at = new Map(tracks.map(row => [row[ID], middle(row)]));
+function drawEdges(view) {
+  const {g, k, result, tracks, thin, focus, on} = view, at = new Map(tracks.map(row => [row[ID], middle(row)])), names = [];
   g.lineWidth = 1.2 * thin; g.strokeStyle = g.fillStyle = SOFT;
-  for (const [target, source, rate] of result.edges[k]) {
-    const a = at.get(source), b = at.get(target);
+  for (const [target, source, rate, relation] of result.edges[k]) {
+    const a = at.get(target), b = at.get(source);
     if (!a || !b || (!on && target !== focus[ID] && source !== focus[ID])) continue;
     g.globalAlpha = .25 + .75 * Math.min(1, rate / 500);
     const angle = Math.atan2(b[1] - a[1], b[0] - a[0]), head = 8 * thin;
@@ -100,7 +114,9 @@ function drawEdges({g, k, result, tracks, thin, focus, on}) {
     g.beginPath(); g.moveTo(...b);
     for (const turn of [2.7, -2.7]) g.lineTo(b[0] + head * Math.cos(angle + turn), b[1] + head * Math.sin(angle + turn));
     g.fill();
+    if (focus || Math.hypot(a[0] - b[0], a[1] - b[1]) > NAMED * thin) names.push({at: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], text: result.relations[relation], colour: SOFT});
   }
+  drawTexts(view, names);
 }
 
 function drawEllipses(view) {
@@ -131,18 +147,23 @@ function drawTracks(view) {
 
 const shortName = name => name.split("-").pop();
 
-function drawIds(view) {  // that of the followed track first, then those with a place free of others
-  const {g} = view, world = g.getTransform(), ratio = window.devicePixelRatio || 1, taken = [];
+function drawIds(view) {  // that of the followed track first
+  const order = [...view.tracks].sort((a, b) => (b === view.focus) - (a === view.focus) || b[SCORE] - a[SCORE]);
+  drawTexts(view, order.map(row => ({at: middle(row), text: shortName(view.result.ids[row[ID]]), bold: row === view.focus,
+    alpha: pale(view, row), colour: view.colour(row)})));
+}
+
+function drawTexts({g}, texts) {  // those with a place free of the ones before, and bold ones
+  const world = g.getTransform(), ratio = window.devicePixelRatio || 1, taken = [];
   g.setTransform(ratio, 0, 0, ratio, 0, 0);
-  for (const row of [...view.tracks].sort((a, b) => (b === view.focus) - (a === view.focus) || b[SCORE] - a[SCORE])) {
-    const p = world.transformPoint(new DOMPoint(...middle(row))), text = shortName(view.result.ids[row[ID]]);
-    const x = p.x / ratio + 6, y = p.y / ratio - 6, mine = row === view.focus;
-    g.font = `${mine ? "bold 14" : "11"}px system-ui, sans-serif`;
+  for (const {at, text, bold, alpha, colour} of texts) {
+    const p = world.transformPoint(new DOMPoint(...at)), x = p.x / ratio + 6, y = p.y / ratio - 6;
+    g.font = `${bold ? "bold 14" : "11"}px system-ui, sans-serif`;
     const width = g.measureText(text).width;
-    if (!mine && taken.some(([a, b, w]) => x < a + w && a < x + width && Math.abs(y - b) < 12)) continue;
+    if (!bold && taken.some(([a, b, w]) => x < a + w && a < x + width && Math.abs(y - b) < 12)) continue;
     taken.push([x, y, width]);
-    g.globalAlpha = pale(view, row); g.lineWidth = 3; g.strokeStyle = "#f5f7f9"; g.strokeText(text, x, y);
-    g.fillStyle = view.colour(row); g.fillText(text, x, y);
+    g.globalAlpha = alpha ?? 1; g.lineWidth = 3; g.strokeStyle = "#f5f7f9"; g.strokeText(text, x, y);
+    g.fillStyle = colour; g.fillText(text, x, y);
   }
   g.setTransform(world);
 }

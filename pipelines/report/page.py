@@ -29,11 +29,11 @@ from data_tools.files import parsed_json, read_bytes, write_text
 from pipelines.config import load_config
 from pipelines.explaining import clock_table
 from pipelines.report.figures import UNSEEN, latency_chart, track_charts, track_figures
-from pipelines.report.scenes import ReportScene, scene_data, start_thresholds, thumbnails
+from pipelines.report.scenes import ReportScene, comparisons, scene_data, start_thresholds, thumbnails
 from saga_fg.errors import InputError
 from saga_fg.tracking import SensorTime
 
-SCRIPTS = ("charts.js", "road.js", "fans.js", "layers.js", "filters.js", "panel.js", "review.js", "player.js")
+SCRIPTS = ("charts", "road", "fans", "layers", "filters", "panel", "visits", "review", "player")
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,8 @@ class Report:
 
 def report_page(report: Report) -> str:
     """Return the HTML text."""
-    scenes = [scene_data(scene) for scene in report.scenes]
+    thresholds = start_thresholds(report.scenes)
+    scenes = [scene_data(scene) | {"comparisons": comparisons(scene, thresholds)} for scene in report.scenes]
     labels = sorted({label for scene in scenes for label in scene["labels"]})
     data = {
         "scenes": scenes,
@@ -72,7 +73,7 @@ def report_page(report: Report) -> str:
         "ghosts": report.ghosts,
         "beside": report.beside,
         "unseen": round(1000 * UNSEEN),
-        "thresholds": start_thresholds(report.scenes),
+        "thresholds": thresholds,
         "review": report.review,
     }
     configuration = f"<pre>{html.escape(report.configuration)}</pre>" if report.configuration else ""
@@ -86,7 +87,7 @@ def report_page(report: Report) -> str:
         ("STYLE", _part("page.css")),
         ("DATA", _packed(data)),
         ("CONNECT", "; connect-src 'self'" if report.review and report.review["server"] else ""),
-        ("SCRIPT", "".join(_part(name) for name in SCRIPTS if report.review or name != "review.js")),
+        ("SCRIPT", "".join(_part(f"{name}.js") for name in SCRIPTS if report.review or name != "review")),
     ):
         page = page.replace(f"<!--{mark}-->", text)
     return page

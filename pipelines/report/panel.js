@@ -8,8 +8,10 @@ function describeTrack(panel, scene, result, k, id, colour) {
     if (row[VX] !== null) facts.push(["speed", `${speed(row).toFixed(1)} m/s`]);
     if (row[XX] !== null) facts.push(["position ±", `${(Math.sqrt((row[XX] + row[YY]) / 2) / 100).toFixed(2)} m`]);
     if (row[COASTING] !== null) facts.push(["unseen for", `${(row[COASTING] / 1000).toFixed(1)} s`]);
-    const led = result.edges[k].filter(e => e[0] === id).map(e => shortName(result.ids[e[1]]));
-    if (led.length) facts.push(["influenced by", led.join(", ")]);
+    result.relations.forEach((relation, number) => {
+      const others = result.edges[k].filter(e => e[0] === id && e[3] === number).map(e => shortName(result.ids[e[1]]));
+      if (others.length) facts.push([relation, others.join(", ")]);
+    });
   } else facts.push(["now", "not there"]);
   facts.push(["from, to", `${scene.times[seen[0]].toFixed(1)} to ${scene.times[seen[seen.length - 1]].toFixed(1)} s`]);
   const title = document.createElement("h2"), list = document.createElement("dl");

@@ -1,5 +1,6 @@
 const $ = id => document.getElementById(id);
-const NEAREST = 1, FARTHEST = 80, START = 9, CLOSE = 20;  // zoom, pixels per m
+const FARTHEST = 1, NEAREST = 80, FITTED = 25, CLOSE = 20;  // zoom, pixels per m: least, most, most that fits, for one box
+const MARGIN = 12, OUTLIERS = .02;  // m around what is shown, and the share of boxes to either side that need not fit
 
 async function unpack(text) {
   const bytes = Uint8Array.from(atob(text), c => c.charCodeAt(0));
@@ -10,9 +11,9 @@ async function unpack(text) {
 function player({scenes, start, thresholds, ghosts, beside, review}) {
   const canvas = $("view"), g = canvas.getContext("2d");
   const shown = Object.fromEntries(LAYERS.map(layer => [layer.name, layer.on]));
-  const filters = makeFilters(scenes, thresholds, ghosts, () => draw());
-  let scene = scenes[0], k = 0, picked = null, timer = null, zoom = START, offset = [0, 0], home = null, views = [], lost = null, pointer = {x: 0, y: 0};
-  // picked: {method, id} of the track that is followed; views: of the last drawing, from left to right; lost: name of one that was followed, and deleted; pointer: where it is, m
+  const filters = makeFilters(scenes, thresholds, ghosts, () => draw(), () => fit(shownAt(k).length ? [k] : undefined));
+  let scene = scenes[0], k = 0, picked = null, timer = null, zoom = CLOSE, offset = [0, 0], aim = [0, 0], views = [], lost = null, pointer = {x: 0, y: 0};
+  // picked: {method, id} of the track that is followed; aim: m ahead and to the left of the vehicle, in the middle of the view; views: of the last drawing, from left to right; lost: name of one that was followed, and deleted; pointer: where it is, m
 
   const last = () => scene.times.length - 1;
   const names = () => $("beside").value ? [$("beside").value, $("method").value] : [$("method").value];
@@ -30,9 +31,7 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
     $("time").max = last();
     for (const layer of LAYERS) $(`show-${layer.name}`).parentElement.hidden = !(layer.there ? layer.there(scene) : true);
     filters.showClasses(scene);
-    home = moves(scene) ? null : extent(scene);
     picked = null;
-    goHome();
     k = 0;
     chooseMethods();
     show(fullest());
@@ -40,7 +39,7 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
   }
 
   function fullest() {  // the first of the moments with the most tracks that are shown
-    const counts = scene.times.map((_, at) => names().reduce((sum, name) => sum + filters.rows(scene, name, at, null).length, 0));
+    const counts = scene.times.map((_, at) => shownAt(at).length);
     return counts.reduce((best, count, at) => count > counts[best] ? at : best, 0);
   }
 
@@ -48,21 +47,31 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
     if (picked && !names().includes(picked.method)) picked = null;
     filters.showScores(names());
     showHorizons(names().map(name => scene.methods[name]), draw);
-    draw();
+    visits.choose(scene, names());
+    fit();
   }
 
-  function extent(scene) {  // of all tracks of a scene without a vehicle that moves; null without tracks
-    const rows = Object.values(scene.methods).flatMap(result => result.moments.flat());
-    if (!rows.length) return null;
-    const [x0, x1, y0, y1] = rows.reduce(([a, b, c, d], row) =>
-      [Math.min(a, row[X]), Math.max(b, row[X]), Math.min(c, row[Y]), Math.max(d, row[Y])], [Infinity, -Infinity, Infinity, -Infinity]);
-    return {x: (x0 + x1) / 200, y: (y0 + y1) / 200, width: (x1 - x0) / 100 + 12, height: (y1 - y0) / 100 + 12};
+  function frame(at) {  // place and direction of the vehicle; of one that stands, north is up
+    const [x, y, yaw] = scene.ego[moves(scene) ? at : 0];
+    return [x / 100, y / 100, moves(scene) ? yaw / 1000 : 0];
   }
 
-  function goHome() {
+  function shownAt(at) { return names().flatMap(name => filters.rows(scene, name, at, null)); }
+
+  function fit(moments = [...scene.times.keys()]) {  // the tracks that are shown at these moments, seen from the vehicle
+    const points = moments.flatMap(at => {
+      const [x, y, yaw] = frame(at), c = Math.cos(yaw), s = Math.sin(yaw);
+      return shownAt(at).map(middle).map(([px, py]) => [(px - x) * c + (py - y) * s, (py - y) * c - (px - x) * s]);
+    });
+    const spans = [0, 1].map(axis => {
+      const values = points.map(point => point[axis]).sort((a, b) => a - b), cut = Math.floor(OUTLIERS * values.length);
+      return values.length ? [values[cut], values[values.length - 1 - cut]] : [-MARGIN, MARGIN];
+    });
+    const sides = spans.map(([low, high]) => high - low + MARGIN);
+    aim = spans.map(([low, high]) => (low + high) / 2);
     offset = [0, 0];
-    const fit = home && Math.min(canvas.clientWidth / names().length / home.width, canvas.clientHeight / home.height);
-    zoom = fit ? Math.max(NEAREST, Math.min(25, fit)) : START;
+    zoom = Math.max(FARTHEST, Math.min(FITTED, canvas.clientWidth / names().length / sides[0], canvas.clientHeight / sides[1]));
+    draw();
   }
 
   function show(moment) {
@@ -74,17 +83,16 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
   }
 
   function centre() {
-    const [ex, ey, yaw] = scene.ego[k], row = rowOf(picked);
-    if (row) return [...middle(row), yaw / 1000];
-    return home ? [home.x, home.y, 0] : [ex / 100, ey / 100, yaw / 1000];
+    const [x, y, yaw] = frame(k), row = rowOf(picked), c = Math.cos(yaw), s = Math.sin(yaw);
+    const place = row ? middle(row) : visits.place() ?? [x + aim[0] * c - aim[1] * s, y + aim[0] * s + aim[1] * c];
+    return [...place, yaw];
   }
 
   function place(pane, panes) {  // world to pixels: driving direction to the right, left of the vehicle up
     const ratio = window.devicePixelRatio || 1, [x, y, yaw] = centre(), width = canvas.clientWidth / panes;
     g.setTransform(ratio, 0, 0, ratio, 0, 0);
     g.beginPath(); g.rect(pane * width, 0, width, canvas.clientHeight); g.clip();
-    const across = home || picked ? .5 : .42;
-    g.translate((pane + across) * width + offset[0], canvas.clientHeight / 2 + offset[1]);
+    g.translate((pane + .5) * width + offset[0], canvas.clientHeight / 2 + offset[1]);
     g.scale(zoom, -zoom);
     g.rotate(-yaw); g.translate(-x, -y);
   }
@@ -93,10 +101,11 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
     if (!scene.times.length) return;
     const ratio = window.devicePixelRatio || 1, methods = names();
     canvas.width = canvas.clientWidth * ratio; canvas.height = canvas.clientHeight * ratio;
+    const step = niceStep(canvas.clientWidth / methods.length / zoom, 7);
     views = methods.map((name, pane) => {
       const followed = picked?.method === name ? picked.id : null;
       const tracks = filters.rows(scene, name, k, followed);
-      const view = {g, thin: 1 / zoom, scene, k, name, result: scene.methods[name], tracks,
+      const view = {g, thin: 1 / zoom, step, scene, k, name, result: scene.methods[name], tracks,
         focus: tracks.find(row => row[ID] === followed) ?? null,
         colour: row => filters.colour(scene, row), shownClass: label => filters.shownClass(scene, label)};
       g.save();
@@ -107,23 +116,27 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
         if (!view.on && !(layer.focused && view.focus)) continue;
         g.save(); layer.draw(view); g.restore();
       }
+      visits.draw(view);
       view.inverse = g.getTransform().inverse();
       g.restore();
       return view;
     });
-    if (methods.length > 1) drawNames(methods, ratio);
-    canvas.dataset.tracks = views.map(view => view.tracks.length).join(" ");
+    drawBorders(methods, ratio, step);
+    Object.assign(canvas.dataset, {tracks: views.map(view => view.tracks.length).join(" "), zoom, step, aim});
     describe();
   }
 
-  function drawNames(methods, ratio) {
-    const width = canvas.clientWidth / methods.length;
+  function drawBorders(methods, ratio, step) {  // names of several methods, and a scale bar as long as a square of the grid
+    const width = canvas.clientWidth / methods.length, low = canvas.clientHeight - 14, end = 14 + step * zoom;
     g.setTransform(ratio, 0, 0, ratio, 0, 0);
-    g.font = "bold 13px system-ui, sans-serif"; g.fillStyle = SOFT; g.strokeStyle = "#c3ccd4";
+    g.font = "bold 13px system-ui, sans-serif"; g.fillStyle = SOFT; g.strokeStyle = "#c3ccd4"; g.lineWidth = 1;
     methods.forEach((name, pane) => {
-      g.fillText(name, pane * width + 12, 20);
+      if (methods.length > 1) g.fillText(name, pane * width + 12, 20);
       if (pane) { g.beginPath(); g.moveTo(pane * width, 0); g.lineTo(pane * width, canvas.clientHeight); g.stroke(); }
     });
+    g.strokeStyle = SOFT; g.lineWidth = 2; g.beginPath();
+    for (const [x, y] of [[14, low - 5], [14, low], [end, low], [end, low - 5]]) g.lineTo(x, y);
+    g.stroke(); g.fillText(`${step} m`, 20, low - 7);
   }
 
   function describe() {
@@ -137,7 +150,17 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
     picked = track;
     lost = null;
     offset = [0, 0];
+    visits.leave();
     draw();
+    remember();
+  }
+
+  function visit(event) {  // a fault or a difference, with the track that it concerns
+    const at = event.method ? scene.methods[event.method].ids.indexOf(event.id) : -1;
+    picked = at < 0 ? null : {method: event.method, id: at};
+    offset = [0, 0];
+    zoom = Math.max(zoom, FITTED / 2);
+    show(event.k);
     remember();
   }
 
@@ -184,7 +207,7 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
     try { history.replaceState(null, "", moment()); } catch { return; }  // a frame of another page may not
   }
 
-  function visit(hash) {  // #scene=...&t=seconds&id=track&method=...&beside=..., each may be left out
+  function open(hash) {  // #scene=...&t=seconds&id=track&method=...&beside=..., each may be left out
     const asked = new URLSearchParams(hash.slice(1)), at = scenes.findIndex(each => each.name === asked.get("scene"));
     if (at >= 0 && scenes[at] !== scene) chooseScene(at);
     for (const select of ["method", "beside"])
@@ -226,9 +249,10 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
       draw();
     },
   };
+  const visits = makeVisits(visit, () => k);
   const editor = review && makeReview(review, stage);
 
-  function resize(factor) { zoom = Math.max(NEAREST, Math.min(FARTHEST, zoom * factor)); draw(); }
+  function resize(factor) { zoom = Math.max(FARTHEST, Math.min(NEAREST, zoom * factor)); draw(); }
 
   function toggle(name) { const box = $(`show-${name}`); box.checked = !box.checked; box.onchange(); }
 
@@ -242,13 +266,14 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
     Escape: ["Esc", "follow none", () => { editor?.cancel(); follow(null); }],
     "+": ["+", "closer; the wheel, too", () => resize(1.25)],
     "-": ["-", "farther", () => resize(.8)],
-    0: ["0", "back to the vehicle", () => { goHome(); follow(null); }],
+    0: ["0", "all that is shown", () => { follow(null); fit(); }],
     "]": ["]", "fewer tracks: a higher least score", () => filters.shift(.05)],
     "[": ["[", "more tracks", () => filters.shift(-.05)],
     g: ["g", "ghosts: tracks that nobody sees now", () => toggle("ghosts")],
     d: ["d", "detections", () => toggle("detections")],
-    e: ["e", "edges of the graph", () => toggle("edges")],
+    e: ["e", "relations: edges of the graph", () => toggle("edges")],
     i: ["i", "ids", () => toggle("ids")],
+    ...visits.keys(scenes),
     ...editor?.keys,
     "?": ["?", "this help", () => $("help").showModal()],
   };
@@ -274,7 +299,7 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
     if (KEYS[e.key]) { e.preventDefault(); KEYS[e.key][2](e); }
   };
   window.onresize = draw;
-  window.onhashchange = () => visit(location.hash);
+  window.onhashchange = () => open(location.hash);
   $("play").onclick = play;
   $("time").oninput = () => show(+$("time").value);
   $("time").onchange = remember;
@@ -287,7 +312,7 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
     await navigator.clipboard?.writeText(location.href.replace(/#.*|$/, "") + moment()).catch(() => {});
     $("link").textContent = "Copied"; setTimeout(() => { $("link").textContent = "Link"; }, 1500);
   };
-  for (const [sign, text] of Object.values(KEYS)) {
+  for (const [sign, text] of Object.values(KEYS).filter(each => each[0])) {
     const dt = document.createElement("dt"), dd = document.createElement("dd");
     dt.textContent = sign; dd.textContent = text; $("keys").append(dt, dd);
   }
@@ -301,7 +326,7 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
   for (const layer of LAYERS) check(layer.name, layer.text ?? layer.name, layer.on, on => { shown[layer.name] = on; });
   chooseScene(0);
   if (start !== null) show(start);
-  visit(location.hash);
+  open(location.hash);
 }
 
 function takesKey(control, key) {  // whether a control that has the focus does something with a key itself

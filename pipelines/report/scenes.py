@@ -4,17 +4,20 @@ Scenes as data of the page's player: rows of whole numbers, centimetres and mill
 
     scene   {"name", "start": s, "origin": [x, y] in m, "times": [s], "ego": [[x, y, yaw]], "labels": [class],
              "methods": {name: {"ids": [name],
-             "moments": [[track, ...]], "edges": [[[target id, source id, rate], ...]],
+             "moments": [[track, ...]], "edges": [[[target id, source id, rate, relation], ...]], "relations": [name],
              "horizons": [ms], "predictions": [[prediction, ...]], [] without}},
              "truth": [[object, ...]], "detections": [[detection, ...]], "road": see below,
-             "map": {"areas": [[kind, ring, ...]], "lines": [[x, y, ...]]} or null, "cameras": {name: [JPEG]}}
+             "map": {"areas": [[kind, ring, ...]], "lines": [[x, y, ...]]} or null, "cameras": {name: [JPEG]},
+             "comparisons": [{"reference": name of a method, null for the truth, "found": name, "events": [event]}]}
     track      [id, class, x, y, length, width, yaw, vx, vy, score, cov_xx, cov_xy, cov_yy, coasting]
     prediction [id, horizon, x, y, cov_xx, cov_xy, cov_yy]
     object     [class, x, y, length, width, yaw, visible]
     detection  [class, x, y, length, width, yaw, score]
+    event      [kind, first moment, last moment, x, y, id of the reference, id found, id found before]
 
 Lengths in cm, yaw in mrad, velocities in cm/s, scores and rates in thousandths, covariances in cm^2, coasting and
-horizons in ms; null is unknown. `ids`, `labels` are counted from 0.
+horizons in ms; null is unknown. `ids`, `labels`, `relations` are counted from 0. Ids of events are names. The kinds of
+events are `SWITCH`, `UNMATCHED`, a box of the reference without one found, and `ADDED`, one found without a box of it.
 
 The road of a scene as the page's player wants it: lanes, stop lines and lights that its frames brought along.
 
@@ -41,13 +44,13 @@ from data_tools.datasets.detection_files import PredictionRows
 from data_tools.datasets.source import AreaMap, Images
 from data_tools.evaluation import best_thresholds, score_sweep
 from data_tools.files import isolated
-from data_tools.metrics import SceneBoxes
+from data_tools.metrics import SceneBoxes, match_scene
 from pipelines.report.figures import unseen_for
 from pipelines.tracking import TrackedScene
 from saga_fg import Boxes, ConstantVelocity, Frame, NodeType, Scene, Sensor
 from saga_fg.model import EdgeRule, NodeTable, sensor_model
 from saga_fg.numerics import FloatArray, IntArray, StrArray, yaw_of
-from saga_fg.types import COLOUR_LABELS, MAX_LIGHT_DISTANCE, Lane, StopLine, TrafficLight
+from saga_fg.types import COLOUR_LABELS, MAX_LIGHT_DISTANCE, Annotations, Lane, StopLine, TrafficLight
 
 Thumbnails = Mapping[str, list[str | None]]
 QUALITY = 60  # of JPEG, in percent
@@ -141,8 +144,9 @@ def _centimetres(points: Any, origin: FloatArray) -> list[int]:
 
 
 Rows = list[list[int | None]]
-Edges = tuple[IntArray, IntArray, FloatArray]
-"""Targets and sources (E,), rows of the table, and rates (E,), 1/s."""
+Edges = tuple[IntArray, IntArray, FloatArray, IntArray]
+"""Targets and sources (E,), rows of the table, rates (E,), 1/s, and numbers (E,) of the rules that found them."""
+SWITCH, UNMATCHED, ADDED = range(3)
 MOVING = 2.0  # m/s, from which a track has moved
 VELOCITY_VARIANCE = 1.0  # (m/s)^2, results do not give it
 UNMEASURED = 1.0  # side of the cube an object of unknown size is drawn as, m
@@ -250,10 +254,62 @@ def _method(
         "ids": ids.tolist(),
         "moments": [rows[a:b] for a, b in pairwise(starts)],
         "edges": [
-            _whole(np.column_stack([number[target], number[source], 1000 * rate]))
-            for target, source, rate in edges_of_frames(table, moments, rules)
+            _whole(np.column_stack([number[target], number[source], 1000 * rate, rule]))
+            for target, source, rate, rule in edges_of_frames(table, moments, rules)
         ],
+        "relations": relation_names(rules),
     }
+
+
+def comparisons(report: ReportScene, thresholds: Mapping[str, float]) -> list[dict[str, Any]]:
+    """Return where each method differs from the truth, and from the methods before it, of scores from `thresholds` on.
+
+    Ready for JSON; see the module's docstring.
+    """
+    scene = report.scene
+    origin = scene.world_T_ego[0, :2, 3] if len(scene) else np.zeros(2)
+    found = {name: table.select(table.score >= thresholds[name]) for name, table in report.tracks.items()}
+    references: dict[str | None, Sequence[Annotations]] = {}
+    if scene.ground_truth is not None:
+        references[None] = scene.ground_truth
+    result = []
+    for name, table in found.items():
+        for reference, boxes in references.items():
+            events = differences(boxes, table.by_frame(len(scene)), origin)
+            result.append({"reference": reference, "found": name, "events": events})
+        references[name] = table.annotations(len(scene))
+    return result
+
+
+def differences(reference: Sequence[Annotations], found: Sequence[SceneBoxes], origin: FloatArray) -> list[list[Any]]:
+    """Return the differences of boxes from a reference, matched as for the evaluation, in order of time.
+
+    A box without a counterpart is one event for as long as it lasts. See the module's docstring.
+    """
+    events: list[list[Any]] = []
+    lasting: dict[tuple[int, str], list[Any]] = {}
+    partner: dict[str, str] = {}
+    matches = match_scene(reference, found)
+    for k, (true, boxes, match) in enumerate(zip(reference, found, matches, strict=True)):
+        missed = np.setdiff1d(np.flatnonzero(true.visible), match.object_row)
+        added = np.setdiff1d(np.arange(len(boxes)), match.track_row)
+        now = dict(zip(true.id[match.object_row].tolist(), boxes.id[match.track_row].tolist(), strict=True))
+        for kind, of, rows in (
+            (SWITCH, true, match.object_row[match.switched]),
+            (UNMATCHED, true, missed),
+            (ADDED, boxes, added),
+        ):
+            places = _centimetres(of.boxes.position[rows, :2], origin)
+            for id_, x, y in zip(of.id[rows].tolist(), places[::2], places[1::2], strict=True):
+                event = lasting.get((kind, id_))
+                if event is not None and kind != SWITCH and event[2] == k - 1:
+                    event[2] = k
+                    continue
+                names = [None, id_] if kind == ADDED else [id_, now.get(id_)]
+                lasting[kind, id_] = event = [kind, k, k, x, y, *names, partner.get(id_)]
+                events.append(event)
+        partner |= now
+    return events
 
 
 def predictions_data(
@@ -288,7 +344,7 @@ def _box_columns(boxes: Boxes, labels: StrArray, origin: FloatArray) -> FloatArr
 
 
 def edges_of_frames(table: SceneBoxes, frames: int, rules: Sequence[EdgeRule]) -> Iterator[Edges]:
-    """Yield the edges that rules find between the reported tracks of each frame.
+    """Yield the edges that rules find between the reported tracks of each frame; see `relation_names`.
 
     A result does not hold the graph of its tracks; but rules need only what a result has.
     """
@@ -318,7 +374,13 @@ def edges_of_frames(table: SceneBoxes, frames: int, rules: Sequence[EdgeRule]) -
             np.concatenate([none, *(rows[p.target] for p in pairs)]),
             np.concatenate([none, *(rows[p.source] for p in pairs)]),
             np.concatenate([np.empty(0), *(p.rate for p in pairs)]),
+            np.repeat(np.arange(len(pairs)), [len(p.rate) for p in pairs]),
         )
+
+
+def relation_names(rules: Sequence[EdgeRule]) -> list[str]:
+    """Return what the edges of each rule say of their target: that it follows the source, say."""
+    return [getattr(rule, "relation", type(rule).__name__) for rule in rules]
 
 
 def latest_detections(scene: Scene, sensors: Mapping[str, Sensor]) -> tuple[list[Boxes], list[FloatArray]]:

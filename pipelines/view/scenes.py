@@ -298,7 +298,7 @@ class _Method:
         known = np.isfinite(table.position_covariance[rows]).all(axis=(1, 2))
         size, yaw = ellipses(table.position_covariance[rows[known]])
         yield "ellipses", Solids(place[rows[known]], size, yaw, colour[known], round=True)
-        target, source, rate = edges
+        target, source, rate, _ = edges
         strips = np.stack([place[source], place[target]], axis=1)
         yield "edges", Lines(list(strips), EDGE, 0.05 + 0.1 * np.minimum(rate, 2.0))
 

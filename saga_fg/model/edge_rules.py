@@ -175,6 +175,7 @@ class EdgeRule(Protocol):
     """Chooses edges from the estimates at the start of an interval.
 
     A rule that has `map_classes` reads nodes of the map of these classes alone; nodes that no rule reads are left out.
+    One that has `relation` gives its edges a name for people, such as "follows", else they have that of its type.
     """
 
     @property
@@ -193,6 +194,7 @@ class Neighbours(Settings):
     """Edges between moving objects that are close and head the same way; by default they share their velocity."""
 
     map_classes: ClassVar[tuple[str, ...]] = ()
+    relation: ClassVar[str] = "moves with"
     interaction: SharedVelocity | CarFollowing | Interaction | AccelerationLaw = settings_group(
         SharedVelocity, "interaction function of the edges"
     )
@@ -252,6 +254,7 @@ class Following(Settings):
     """
 
     map_classes: ClassVar[tuple[str, ...]] = ()
+    relation: ClassVar[str] = "follows"
     interaction: SharedVelocity | CarFollowing | IntelligentDriver | SmoothDriver | Interaction | AccelerationLaw = (
         settings_group(CarFollowing, "interaction function of the edges")
     )
@@ -365,6 +368,7 @@ class Repulsion(Settings):
 
     classes: ClassVar[tuple[str, ...]] = ("pedestrian",)
     interaction: ClassVar[SocialForce] = SocialForce()
+    relation: ClassVar[str] = "keeps away from"
     sources: tuple[str, ...] = setting(("pedestrian",), "classes that push; more: pushed by more")
 
     @property
@@ -449,6 +453,7 @@ class Attached(Settings):
 
     map_classes: ClassVar[tuple[str, ...]] = ()
     interaction: ClassVar[RigidCoupling] = RigidCoupling()
+    relation: ClassVar[str] = "is attached to"
     rate: ClassVar[float] = 3.0  # 1/s, usual 1 to 5
     heading_scale: ClassVar[float] = 0.5  # rad, sigma of the kernel on the difference of headings
     attached: tuple[str, ...] = setting(("trailer",), "classes of attached objects; more: more pairs are sought")

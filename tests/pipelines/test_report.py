@@ -31,7 +31,7 @@ from pipelines.report import (
 )
 from pipelines.report.figures import COLUMNS, track_charts, track_figures, unseen_for
 from pipelines.report.page import record_path, write_run_record
-from pipelines.report.scenes import edges_of_frames, scene_data
+from pipelines.report.scenes import edges_of_frames, relation_names, scene_data
 from pipelines.tracking import TrackedScene, track_scene
 from saga_fg import Boxes, Frame, InputError, Scene
 from saga_fg.numerics.geometry import yaw_transform
@@ -91,9 +91,11 @@ def test_edges_lead_from_a_leader_to_its_follower():
     rule = CONFIG.tracker.edges[0]
     boxes = Boxes.of(["car"] * 3, [[0, 0, 0], [10, 0, 0], [0, 30, 0]], [[4, 2, 1.5]] * 3, [0.0] * 3, [[8, 0]] * 3)
     table = SceneBoxes(np.zeros(3, dtype=np.int64), np.array(["behind", "ahead", "aside"]), boxes, np.ones(3))
-    ((target, source, rate),) = edges_of_frames(table, 1, (rule,))
+    ((target, source, rate, number),) = edges_of_frames(table, 1, (rule,))
     assert [(table.id[t], table.id[s]) for t, s in zip(target, source, strict=True)] == [("behind", "ahead")]
     assert rate[0] > 0
+    assert number.tolist() == [0]
+    assert relation_names((rule,)) == ["follows"]
 
 
 def test_what_is_not_known_is_null():

@@ -17,10 +17,21 @@ from data_tools.datasets.nuscenes.source import NuScenesSource
 from data_tools.datasets.source import clipped
 from data_tools.evaluation import best_thresholds, score_sweep
 from data_tools.figures import Chart, Series, class_colours
-from data_tools.metrics import SceneBoxes
+from data_tools.metrics import SceneBoxes, scene_metrics
 from pipelines.report import Report, ReportScene, report_page
-from pipelines.report.scenes import PLAIN, scene_data, start_thresholds, thumbnails
+from pipelines.report.scenes import (
+    ADDED,
+    PLAIN,
+    SWITCH,
+    UNMATCHED,
+    comparisons,
+    scene_data,
+    start_thresholds,
+    thumbnails,
+)
 from saga_fg import Boxes, InputError, Scene
+from saga_fg.model.edge_rules import NO_PAIRS, Following, Pairs
+from saga_fg.model.interactions import SharedVelocity
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.types.dataset import Annotations
 from tests.data_tools.kitti_example import write_sequence
@@ -84,6 +95,10 @@ HELPERS = """
   const key = (name, more) => document.dispatchEvent(new KeyboardEvent("keydown", {key: name, bubbles: true, ...more}));
   const followed = () => ($of("panel").querySelector("h2") || {}).textContent || "";
   const at = k => { $of("time").value = k; $of("time").oninput(); };
+  const pixel = (ahead, aside, width) => {  // of a place seen from the vehicle
+    const {zoom, aim} = $of("view").dataset, [a, b] = aim.split(",").map(Number);
+    return [width / 2 + (ahead - a) * zoom, $of("view").clientHeight / 2 - (aside - b) * zoom];
+  };
   const chip = name => [...$of("classes").children].find(each => each.textContent === name);
 """
 
@@ -214,10 +229,11 @@ def test_two_results_side_by_side(tmp_path):
     const box = view.getBoundingClientRect();
     view.dispatchEvent(new PointerEvent(type, {clientX: box.x + x, clientY: box.y + y, pointerId: 1, bubbles: true}));
   };
-  const width = view.clientWidth / 2;  // a car is 10 m before the vehicle, 9 pixels to a metre
+  const width = view.clientWidth / 2;
   for (const left of [0, width]) {
-    click("pointerdown", left + .42 * width + 90, view.clientHeight / 2);
-    click("pointerup", left + .42 * width + 90, view.clientHeight / 2);
+    const [x, y] = pixel(10, 0, width);  // a car is 10 m before the vehicle
+    click("pointerdown", left + x, y);
+    click("pointerup", left + x, y);
     (found.picked ??= []).push([followed(), new URLSearchParams(location.hash.slice(1)).get("id")]);
     key("0");
   }
@@ -228,6 +244,161 @@ def test_two_results_side_by_side(tmp_path):
     assert found["two"] == "2 3"
     assert found["sliders"] == 2
     assert found["picked"] == [["track car-1", "car-1"]] * 2
+
+
+def test_the_view_fits_what_is_shown_and_a_class_alone_fills_it(tmp_path):
+    found = tried(
+        """
+  const view = $of("view"), inside = places => places.every(([ahead, aside]) => {
+    const [x, y] = pixel(ahead, aside, view.clientWidth);
+    return x > 0 && y > 0 && x < view.clientWidth && y < view.clientHeight;
+  });
+  at(5);
+  found.cars = inside([[8, 0], [12, 6], [12, -6]]);
+  found.all = +view.dataset.zoom;
+  chip("pedestrian").ondblclick();
+  found.walker = pixel(10, -6, view.clientWidth).map((v, axis) => v / [view.clientWidth, view.clientHeight][axis]);
+  found.alone = +view.dataset.zoom;
+  chip("pedestrian").ondblclick(); found.again = inside([[8, 0], [12, 6], [12, -6]]);
+  key("+"); found.closer = +view.dataset.zoom; key("0"); found.home = +view.dataset.zoom;
+  const step = +view.dataset.step, part = view.clientWidth / view.dataset.zoom / step;
+  found.scale = [step, part];
+""",
+        tmp_path,
+    )
+    assert found["cars"]
+    assert found["again"]
+    assert found["alone"] >= found["all"]
+    assert found["walker"] == pytest.approx([0.5, 0.5], abs=0.01)
+    assert found["closer"] > found["home"] == pytest.approx(found["all"])
+    step, squares = found["scale"]
+    assert step / 10 ** np.floor(np.log10(step)) in (1, 2, 5)
+    assert 2 <= squares <= 7
+
+
+def test_the_scale_bar_is_as_long_as_it_says(tmp_path):
+    script = """
+  const view = $of("view"), g = view.getContext("2d"), low = view.clientHeight - 14;
+  const dark = x => g.getImageData(x, low, 1, 1).data[3] > 128;
+  const end = Math.floor(14 + view.dataset.step * view.dataset.zoom);
+  found.bar = [dark(15), dark(end - 2), dark(end + 4)];
+"""
+    assert tried(script, tmp_path)["bar"] == [True, True, False]
+
+
+def judged() -> ReportScene:
+    """Two cars; one track changes its name, one begins late, one is of nothing; a second result misses a car."""
+
+    def table(rows):
+        rows = sorted(rows)
+        boxes = Boxes.of(["car"] * len(rows), [[2.5 * k, y, 0.0] for k, _, y in rows], [[4.0, 2.0, 1.5]] * len(rows))
+        return SceneBoxes(
+            np.array([row[0] for row in rows]), np.array([row[1] for row in rows]), boxes, np.full(len(rows), 0.9)
+        )
+
+    moments = range(MOMENTS)
+    whole = [(k, "1" if k < 6 else "2", 0.0) for k in moments] + [(k, "3", 6.0) for k in moments if k >= 4]
+    nothing = [(k, "4", 30.0) for k in (2, 3, 4, 7)]
+    truth = table([(k, name, y) for k in moments for name, y in (("a", 0.0), ("b", 6.0))]).annotations(MOMENTS)
+    poses = np.array([yaw_transform(2.5 * k, 0.0) for k in moments])
+    recorded = Scene("s", np.arange(MOMENTS) * 0.5, poses, ("",) * MOMENTS, (), truth)
+    few = [(k, "9", 0.0) for k in moments]
+    return ReportScene(recorded, {"few": table(few), "whole": table(whole + nothing)}, {})
+
+
+def test_faults_are_those_of_the_evaluation_each_for_as_long_as_it_lasts():
+    report = judged()
+    found = {
+        (each["reference"], each["found"]): each["events"] for each in comparisons(report, {"few": 0.0, "whole": 0.0})
+    }
+    for name, table in report.tracks.items():
+        metrics = scene_metrics(report.scene.ground_truth, table.by_frame(MOMENTS))
+        events = found[None, name]
+        lasted = {kind: sum(e[2] - e[1] + 1 for e in events if e[0] == kind) for kind in (SWITCH, UNMATCHED, ADDED)}
+        expected = {SWITCH: metrics.switches, UNMATCHED: metrics.misses, ADDED: metrics.false_positives}
+        assert lasted == expected
+    whole = found[None, "whole"]
+    assert [event for event in whole if event[0] == SWITCH] == [[SWITCH, 6, 6, 1500, 0, "a", "2", "1"]]
+    assert [event for event in whole if event[0] == UNMATCHED] == [[UNMATCHED, 0, 3, 0, 600, "b", None, None]]
+    assert [event[1:3] for event in whole if event[0] == ADDED] == [[2, 4], [7, 7]]
+    between = found["few", "whole"]
+    assert [event[5:] for event in between if event[0] == SWITCH] == [["9", "2", "1"]]
+    assert sorted(event[6] for event in between if event[0] == ADDED) == ["3", "4", "4"]
+    assert ("whole", "few") not in found
+
+
+def test_boxes_below_the_score_that_is_shown_are_no_faults():
+    report = judged()
+    weak = replace(report.tracks["whole"], score=np.full(len(report.tracks["whole"]), 0.1))
+    found = comparisons(replace(report, tracks={"whole": weak}), {"whole": 0.3})
+    assert [event[:3] for event in found[0]["events"]] == [[UNMATCHED, 0, MOMENTS - 1]] * 2
+
+
+def test_faults_and_differences_are_visited_one_after_the_other(tmp_path):
+    page = report_page(Report("faults", [], [judged()]))
+    script = """
+  const clock = () => $of("clock").value, said = () => $of("visited").value;
+  at(0);
+  key("s"); found.switched = [clock(), followed(), said()];
+  key("f"); found.false_ = [clock(), followed(), said()];
+  key("f"); found.around = [clock(), said().slice(0, 16)];
+  $of("last-false").click(); found.back = clock();
+  key("m"); found.missed = [clock(), followed(), said()];
+  key("Escape"); found.left = said();
+  found.alone = [...$of("visits").querySelectorAll("span")].map(each => each.textContent);
+  $of("beside").value = "few"; $of("beside").onchange();
+  at(0); key("v"); found.first = [clock(), followed(), said()];
+  key("V"); found.last = [clock(), said().slice(0, 17)];
+  found.beside = [...$of("visits").querySelectorAll("span")].map(each => each.textContent);
+"""
+    found = tried_in_browser(page, HELPERS + script, tmp_path)
+    assert found["faults"] == []
+    assert found["switched"] == ["3.0 s", "track 2", "switch 1 of 1: object a, track 1 → 2"]
+    assert found["false_"] == ["3.5 s", "track 4", "false box 2 of 2: track 4 without an object for a moment"]
+    assert found["around"] == ["1.0 s", "false box 1 of 2"]
+    assert found["back"] == "3.5 s"
+    assert found["missed"] == ["0.0 s", "", "miss 1 of 1: object b without a track for 1.5 s"]
+    assert found["left"] == ""
+    assert found["alone"] == ["‹ 1 switch ›", "‹ 1 miss ›", "‹ 2 false boxes ›"]
+    assert found["beside"] == [*found["alone"], "‹ 4 differences ›"]
+    assert found["first"] == ["1.0 s", "track 4", "difference 1 of 4: 4 in whole alone for 1.0 s"]
+    assert found["last"] == ["3.5 s", "difference 4 of 4"]
+
+
+def test_a_page_without_truth_or_a_second_result_has_nothing_to_visit(tmp_path):
+    page = report_page(Report("plain", [], [crowded(["car"] * 2)]))
+    script = (
+        'found.shown = getComputedStyle($of("visits")).display; key("s"); key("v"); found.clock = $of("clock").value;'
+    )
+    found = tried_in_browser(page, HELPERS + script, tmp_path)
+    assert (found["faults"], found["shown"], found["clock"]) == ([], "none", "0.0 s")
+
+
+def test_relations_have_the_names_of_their_rules(tmp_path):
+    class Admires:
+        interaction = SharedVelocity()
+
+        def pairs(self, nodes):
+            return Pairs(np.array([0]), np.array([1]), np.array([0.4])) if len(nodes) > 1 else NO_PAIRS
+
+    report = crowded(["car", "car"])
+    data = scene_data(replace(report, rules=(Following(), Admires())))["methods"]["saga"]
+    assert data["relations"] == ["follows", "Admires"]
+    assert [0, 1, 400, 1] in data["edges"][3]
+    page = report_page(Report("relations", [], [replace(report, rules=(Admires(),))]))
+    script = """
+  const texts = [], fill = CanvasRenderingContext2D.prototype.fillText;
+  CanvasRenderingContext2D.prototype.fillText = function (text, ...rest) {
+    texts.push(text);
+    fill.call(this, text, ...rest);
+  };
+  key("e"); found.texts = texts;
+  at(3); key("n"); found.facts = $of("panel").textContent;
+"""
+    found = tried_in_browser(page, HELPERS + script, tmp_path)
+    assert found["faults"] == []
+    assert "Admires" in found["texts"]
+    assert "Admires" in found["facts"]
 
 
 def test_keys_and_their_help(tmp_path):
