@@ -17,8 +17,9 @@ scalars of numbers, truth values and texts, and objects of `saga_fg` and `factor
 node refers to its parts by their places before its own, and the last node is the root. A shared value is one node.
 
 Objects are dataclasses and named tuples. They are made again by the constructors of their classes, which check their
-arguments; classes that are not loaded are refused. A running graph is made again from its record. Of functions there
-are the methods of `METHODS` of such objects, by which nonlinear factors are evaluated.
+arguments; classes that are not loaded are refused, and so are tables whose columns have different lengths. A running
+graph is made again from its record. Of functions there are the methods of `METHODS` of such objects, by which nonlinear
+factors are evaluated.
 """
 
 import fcntl
@@ -43,6 +44,7 @@ from pipelines.serving.settings import LogLimit
 from pipelines.serving.stream import StreamTracker
 from saga_fg.errors import InputError
 from saga_fg.graph import GraphRecord, SceneFactorGraph
+from saga_fg.numerics import Columns
 
 PACKAGES = ("saga_fg", "factors")
 METHODS = ("residual", "jacobians", "residual_jacobians")
@@ -124,7 +126,7 @@ def read_tree(nodes: list[Any], arrays: bytes) -> Any:
 
 
 def _value(node: Any, values: list[Any], arrays: bytes) -> Any:
-    if node is None or type(node) in (bool, int, float, str):
+    if node is None or type(node) in (bool, int, str) or (type(node) is float and math.isfinite(node)):
         return node
     match node:
         case {"float": str(text)}:
@@ -146,7 +148,10 @@ def _value(node: Any, values: list[Any], arrays: bytes) -> Any:
         case {"array": [str(dtype), list(shape), str(order), bool(writeable), int(start)]}:
             return _read_array(np.dtype(dtype), tuple(shape), order, writeable, start, arrays)
         case {"object": [str(module), str(name)], "parts": dict(places)}:
-            return _class(module, name)(**{part: _at(values, place) for part, place in places.items()})
+            made = _class(module, name)(**{part: _at(values, place) for part, place in places.items()})
+            if isinstance(made, Columns):
+                made.check_lengths()
+            return made
     raise InputError(f"state: unknown node {str(node)[:60]}")
 
 

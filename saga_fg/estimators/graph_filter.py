@@ -298,6 +298,8 @@ class GraphFilter(Estimator):
     def restore(self, state: GraphState) -> None:
         """Continue from a snapshot."""
         require_type("state", state, GraphState)
+        if state.posterior is not None:
+            state.posterior.check_shapes()
         self._smoother.restore(state.graph)
         self._layout, self._keys, self._independent = state.layout, state.keys, state.independent
         self._window, self._labels = state.window, state.labels

@@ -383,5 +383,6 @@ class JointKalmanFilter(Estimator):
     def restore(self, state: KalmanState) -> None:
         """Continue from a snapshot, bit-identically."""
         require_type("state", state, KalmanState)
+        state.x.check_shapes()
         self._state, self._predictions, self._time = state.x, state.predictions, state.time
         self._auxiliary = state.auxiliary or AuxiliaryVariables()

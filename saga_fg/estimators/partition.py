@@ -41,6 +41,8 @@ from saga_fg.numerics import (
     unchecked,
 )
 
+MAX_DIM = 1000  # of the state of one node: far above those of objects, poses and landmarks
+
 
 @dataclass(frozen=True, eq=False)
 class StateLayout:
@@ -52,6 +54,8 @@ class StateLayout:
 
     def __post_init__(self) -> None:
         nodes, dims = checked_ids("nodes", self.nodes), checked_rows("dims", self.dims, len(self.nodes))
+        if len(dims) and not 1 <= dims.min() <= dims.max() <= MAX_DIM:
+            raise InputError(f"dims: expected sizes of states of 1 to {MAX_DIM}, got {dims.min()} to {dims.max()}")
         for name, array in (("nodes", nodes), ("dims", dims), ("offsets", np.concatenate([[0], np.cumsum(dims)]))):
             object.__setattr__(self, name, array.astype(np.int64, copy=False))
 
@@ -348,6 +352,12 @@ class BlockGaussian:
             return BlockGaussian.empty()
         together = BlockGaussian(Partition(layout, np.zeros(len(layout), dtype=np.int64)), mean, (P[None],))
         return together.over(together.uncorrelated(0.0))
+
+    def check_shapes(self) -> None:
+        """Raise `InputError` unless mean and blocks are of the sizes of the partition: kernels rely on it."""
+        shapes = [(*places.shape, places.shape[1]) for places in self.partition.groups]
+        if self.mean.shape != (self.layout.size,) or [block.shape for block in self.blocks] != shapes:
+            raise InputError(f"state: expected a mean of {self.layout.size} numbers and blocks of {shapes}")
 
     @property
     def layout(self) -> StateLayout:

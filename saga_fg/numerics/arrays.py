@@ -225,6 +225,13 @@ class Columns:
     def __len__(self) -> int:
         return len(self.__dict__[next(iter(self.__dataclass_fields__))])
 
+    def check_lengths(self) -> None:
+        """Raise `InputError` unless all columns have as many rows as the first."""
+        for name in self.__dataclass_fields__:
+            column = getattr(self, name)
+            if isinstance(column, np.ndarray | Columns) and len(column) != len(self):
+                raise InputError(f"{type(self).__name__}.{name}: expected {len(self)} rows, got {len(column)}")
+
     def select(self, rows: IntArray | BoolArray | slice | Sequence[int]) -> Self:
         """The rows of a mask, of row indices or of a slice."""
         if isinstance(rows, slice):

@@ -21,6 +21,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from saga_fg.errors import InputError
 from saga_fg.estimators import Estimator, Measurements
 from saga_fg.graph import EGO_POSE, SceneFactorGraph, key_of
 from saga_fg.model import POSITION, VELOCITY, Mixture, ModeTable, Motion, NodeType, SceneGraph, discretise, own_motion
@@ -242,6 +243,13 @@ class JointTrackState:
         """(k,) tracks for which the solver has found the minimum of the graph; all where it is linear."""
         unsettled = self.estimator.unsettled
         return ~np.isin(ids, unsettled) if len(unsettled) else np.ones(len(ids), dtype=bool)
+
+    def check_nodes(self, ids: IntArray, label: StrArray) -> None:
+        """Raise `InputError` unless there are nodes of these ids, of the sizes of these classes."""
+        layout = self.estimator.posterior().layout
+        expected = [node_type.dim for node_type in self.types_of(label)]
+        if layout.dims[layout.rows(ids)].tolist() != expected:
+            raise InputError(f"state: expected nodes of the sizes {expected} for the classes {label.tolist()}")
 
     def places(self, label: StrArray) -> IntArray:
         """(n, 4) where x, y, vx, vy are in the state of each track, -1 for none."""

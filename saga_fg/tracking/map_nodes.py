@@ -40,6 +40,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from saga_fg.errors import InputError
 from saga_fg.model import (
     EdgeRule,
     GreenLight,
@@ -326,6 +327,12 @@ class MapNodes:
 
     def __len__(self) -> int:
         return len(self.id)
+
+    def check_lengths(self) -> None:
+        """Raise `InputError` unless all that is known of the nodes has their number."""
+        for name in ("label", "name", "place", "light"):
+            if len(getattr(self, name)) != len(self):
+                raise InputError(f"{name}: expected one for each of {len(self)} nodes of the map")
 
     def belief(self, light: str) -> Mapping[str, float]:
         """Probabilities of the colours of a light, by colour; raises `KeyError` for one that is no node."""

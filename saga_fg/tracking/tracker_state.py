@@ -317,8 +317,11 @@ class TrackerState:
         return TrackerSnapshot(**{name: getattr(twin, name) for name in _VALUES}, joint=self.joint.snapshot())
 
     def restore(self, snapshot: TrackerSnapshot) -> None:
-        """Continue from a snapshot, which stays as it is."""
+        """Continue from a snapshot, which stays as it is. Raises `InputError` if its parts do not fit each other."""
+        snapshot.map_nodes.check_lengths()
         self.joint.restore(snapshot.joint)
+        for part in (snapshot.table, snapshot.map_nodes):
+            self.joint.check_nodes(part.id, part.label)
         for name in _VALUES:
             setattr(self, name, getattr(snapshot, name))
         self._part_from_others()

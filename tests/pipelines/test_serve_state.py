@@ -1,6 +1,8 @@
 """The state of a service on disk."""
 
 import errno
+import hashlib
+import json
 import os
 import signal
 import stat
@@ -235,3 +237,25 @@ def test_a_state_that_does_not_fit_is_never_half_used(tmp_path):
         write_state(path, HEADER, state)
         with pytest.raises(InputError, match="expected a state that fits"):
             kept(stream(), path)
+
+
+def test_values_that_no_service_writes_are_refused(tmp_path, subtests):
+    service, path = stream(), tmp_path / "state.saga"
+    keeper = kept(service, path)
+    file_sent(service, 0, 1)
+    keeper.save()
+    keeper.release()
+    form, _, header, nodes, arrays = path.read_bytes().split(b"\n", 4)
+    labels = next(node["array"] for node in json.loads(nodes) if "array" in node and node["array"][0] == "<U6")
+    for old, new, message in (
+        (json.dumps(labels), json.dumps([labels[0], [0], *labels[2:]]), r"label: expected 1 rows, got 0"),
+        ("0.1", "NaN", "unknown node nan"),
+        ("0.1", "1e999", "unknown node inf"),
+    ):
+        with subtests.test(new):
+            forged = nodes.replace(old.replace(" ", "").encode(), new.encode(), 1)
+            assert forged != nodes
+            content = b"\n".join([header, forged, arrays])
+            path.write_bytes(b"\n".join([form, hashlib.sha256(content).hexdigest().encode(), content]))
+            with pytest.raises(InputError, match=message):
+                kept(stream(), path)
