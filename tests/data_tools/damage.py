@@ -12,7 +12,7 @@ import json
 import random
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -208,6 +208,9 @@ def targets(folder: Path) -> dict[str, Target]:
         **_tools(folder / "tools"),
         "predictions": one("a.predictions.csv", PREDICTIONS, lambda path: read_predictions(folder / "a")),
         "state": _state(folder / "state.saga", config),
+        "state, graph": _state(
+            folder / "graph.saga", replace(config, tracker=replace(config.tracker, estimator="isam2"))
+        ),
         "journal": one("tracks.csv.journal.jsonl", JOURNAL, lambda path: list(read_events(path))),
         "run record": Target((table("r.run.json", RECORD),), lambda: read_run_record(folder / "r.json")),
         "record of labels": Target((table("run.json", LABEL_RECORD),), lambda: read_label_run(folder)),
