@@ -20,7 +20,7 @@ from benchmarks.recording_sets import RecordingSet
 from benchmarks.situations import colours_at
 from data_tools.figures import COLOURS, png
 from data_tools.files import write_bytes
-from pipelines.learning.gaps import CAP, Contender, JudgedRun
+from pipelines.learning.interactions import CAP, Contender, JudgedRun
 from saga_fg.errors import InputError
 from saga_fg.learning.labelled_scene import Gap, LabelledScene
 from saga_fg.numerics import FloatArray

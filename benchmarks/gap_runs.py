@@ -1,7 +1,7 @@
 """Runs of trackers through gaps of recordings, real and made, judged by identity and place.
 
 A real gap lasts from the last moment at which a labelled object has a detection to the next one. Made gaps and errors
-are those of `pipelines.learning.gaps`.
+are those of `pipelines.learning.interactions`.
 
 kept   the track that holds the object `SETTLING` s after the gap is the one that held it before
 error  distance of that track, while it is not detected, to the label, m; `CAP` where it is not known or farther away
@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.situations import situations_of
 from data_tools.metrics import nees
-from pipelines.learning.gaps import CAP, Contender, Errors, JudgedRun, classes_of, tracks_without
+from pipelines.learning.interactions import CAP, Contender, Errors, JudgedRun, classes_of, tracks_without
 from pipelines.tracking import Progress
 from saga_fg.learning.labelled_scene import LENGTHS, LONGEST, Gap, LabelledScene, is_moving, made_gaps, reached
 from saga_fg.model import Sensor

@@ -1,6 +1,6 @@
 """Objects that nobody sees for some seconds, through the whole tracker on detections: identity and place.
 
-Every contender tracks every recording, with all detections and with some taken away (`pipelines.learning.gaps`).
+Every contender tracks every recording, with all detections and with some taken away (`pipelines.learning.interactions`).
 Intervals are paired bootstraps over recordings; those that overlap in time count as one.
 """
 
@@ -28,8 +28,7 @@ from pipelines.cli.console import progress_bar, writable
 from pipelines.cli.options import Config
 from pipelines.config import TrackConfig, load_config
 from pipelines.learning import learned_motions
-from pipelines.learning.gaps import Contender
-from pipelines.learning.interactions import LEARNED, LearningSettings, learn_interactions
+from pipelines.learning.interactions import LEARNED, Contender, LearningSettings, learn_interactions
 from pipelines.tracking import Progress
 from saga_fg.errors import InputError
 from saga_fg.learning import measured_trajectories

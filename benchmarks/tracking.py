@@ -20,7 +20,7 @@ from benchmarks.variants import COMPONENTS, SHIPPED, contenders
 from data_tools.metrics import LabelErrors, calibration, error_summary, errors_by_class
 from pipelines.cli.options import Config
 from pipelines.config import load_config
-from pipelines.learning.gaps import Contender
+from pipelines.learning.interactions import Contender
 from pipelines.tracking import TrackedScene, track_scene
 
 KF, BASELINE = "kf", "centerpoint"

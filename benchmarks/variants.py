@@ -15,7 +15,7 @@ from typing import Any
 from benchmarks.runner import chosen
 from pipelines.config import METHODS, Method, TrackConfig
 from pipelines.configuration import load_settings
-from pipelines.learning.gaps import Contender
+from pipelines.learning.interactions import Contender
 from saga_fg.errors import InputError
 from saga_fg.model import (
     ConstantVelocity,

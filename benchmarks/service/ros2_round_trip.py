@@ -20,7 +20,7 @@ from benchmarks.service.served import CirclingObjects
 from data_tools.datasets.mcap.objects import AUTOWARE_CLASSES, pose, vector
 from data_tools.datasets.mcap.recording import LoggedMessage
 from data_tools.datasets.mcap.ros2_types import Columns, encoded, header
-from pipelines.serving.dds import Ros2Network, payload_decoder
+from pipelines.serving.ros2 import Ros2Network, payload_decoder
 from saga_fg.errors import SagaError
 
 INTERVAL = 0.1  # s between frames

@@ -19,7 +19,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from data_tools.datasets.detection_files import write_rows
-from data_tools.files import parsed_json, read_lines
+from data_tools.files import check_writable, parsed_json, read_lines, read_text, write_text
 from saga_fg.errors import InputError, unknown_name
 from saga_fg.smoothing.corrections import Correction, correction_from
 
@@ -42,6 +42,20 @@ def corrections_of_lines(lines: Iterable[str], path: Path) -> tuple[Correction, 
             origin = f"{path}: line {number}"
             found.append(correction_from(parsed_json(line, origin), origin))
     return tuple(found)
+
+
+def correction_lines(path: Path) -> list[str]:
+    """The lines of a file, none where it is not there."""
+    return read_text(path).splitlines() if path.exists() else []
+
+
+def write_correction_lines(path: Path, lines: Sequence[str]) -> None:
+    """Write a file whole; one without corrections goes, as readers take none."""
+    if any(line.strip() for line in lines):
+        write_text(path, "".join(f"{line}\n" for line in lines))
+    else:
+        check_writable(path)
+        path.unlink(missing_ok=True)
 
 
 def check_classes(corrections: Iterable[Correction], classes: tuple[str, ...]) -> None:

@@ -4,10 +4,8 @@ folder of labels + record of its run -> `ReviewSession` <-> `ReviewServer` <-> t
                                      -> `export_labels` -> a labelling tool -> `import_edits` -> corrections
 """
 
-from pipelines.review.exchange import export_labels, import_edits
-from pipelines.review.record import LabelRun, read_label_run
-from pipelines.review.server import ReviewServer
-from pipelines.review.session import CORRECTIONS, ReviewSession
+from pipelines.review.exchange import LabelRun, export_labels, import_edits, read_label_run
+from pipelines.review.server import CORRECTIONS, ReviewServer, ReviewSession
 
 __all__ = [
     "CORRECTIONS",

@@ -1,20 +1,116 @@
-"""Labels out to a labelling tool, and the edits that were made there back as corrections."""
+"""Labels out to a labelling tool, and the edits that were made there back as corrections.
+
+Labels can be made again from the record of their run: the configuration of its `RunRecord` is YAML of a `LabelRun`.
+"""
 
 import json
 from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
+from data_tools.datasets.corrections import correction_lines, write_correction_lines
+from data_tools.datasets.detection_files import read_tracks
 from data_tools.datasets.edits import Edits
+from data_tools.datasets.given_tracks import TrackedRecordings, read_given_tracks
 from data_tools.datasets.labelling_tools import exchanged, read_from_tool, tool_format, write_for_tool
-from data_tools.files import atomic_directory, parsed_json, read_text, write_text
+from data_tools.datasets.results import SceneResult, scene_result
+from data_tools.datasets.source import DatasetSource, dataset_names, dataset_source
+from data_tools.files import atomic_directory, parsed_json
 from data_tools.lidar import ScanSequence, write_cloud
-from pipelines.review.record import LabelRun, labelled_scenes
+from pipelines.config import Method
+from pipelines.configuration import read_settings, write_settings
+from pipelines.report import RunRecord, read_run_record
 from pipelines.scale_out import file_name
-from saga_fg.errors import InputError
+from pipelines.smoothing import SmoothConfig
+from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import FloatArray, transform_points
+from saga_fg.types import Dataset, Scene
+
+
+@dataclass(frozen=True)
+class LabelRun:
+    """All that labels follow from.
+
+    dataset      name, or MODULE:CLASS; options: its own, as YAML
+    tracks       files of other trackers; corrections: a file, "" for none
+    directory    where the command ran, for relative paths
+    """
+
+    config: SmoothConfig = field(default_factory=SmoothConfig)
+    method: Method = "saga"
+    dataset: str = ""
+    options: str = ""
+    tracks: tuple[str, ...] = ()
+    corrections: str = ""
+    directory: str = ""
+
+    @classmethod
+    def of_command(
+        cls,
+        source: DatasetSource,
+        method: Method,
+        config: SmoothConfig,
+        tracks: Sequence[Path] | None,
+        corrections: Path | None,
+    ) -> Self:
+        """A run of this process; options are left out that YAML can't hold, of a dataset of somebody else."""
+        kind, options = type(source), ""
+        name = kind.name if kind.name in dataset_names() else f"{kind.__module__}:{kind.__qualname__}"
+        with suppress(TypeError):
+            options = write_settings(source, comments=False)
+        return cls(
+            config, method, name, options, tuple(map(str, tracks or ())), str(corrections or ""), str(Path.cwd())
+        )
+
+    @property
+    def record(self) -> RunRecord:
+        """The record, to be written beside the labels."""
+        return RunRecord(self.method, write_settings(self, comments=False), {})
+
+    @contextmanager
+    def open(self) -> Iterator[tuple[DatasetSource, Dataset]]:
+        """The recordings, for the length of a block. Raises `InputError` where they can't be read any more."""
+        source = read_settings(dataset_source(self.dataset), self.options, "options")
+        with source.open() as dataset:
+            given = read_given_tracks(source, [Path(path) for path in self.tracks])
+            yield source, TrackedRecordings(dataset, given) if given else dataset
+
+
+def read_label_run(folder: Path) -> LabelRun:
+    """Read the record in a folder of labels. Raises `InputError` where there is none, or it is another's."""
+    record = read_run_record(folder) if folder.is_dir() else None
+    if record is None:
+        raise InputError(f"{folder}: expected a folder that saga-fg smooth wrote, with the record run.json of its run")
+    with error_context(f"{folder / 'run.json'}: expected the record of labels"):
+        run = read_settings(LabelRun, record.configuration, "configuration")
+        if not Path(run.directory).is_dir():
+            raise InputError(f"directory: expected the folder where they were made, there is no {run.directory}")
+    return run
+
+
+def labelled_scenes(folder: Path, scenes: Mapping[str, Scene]) -> Iterator[SceneResult]:
+    """The labels of the scenes, from the table of the folder or those of its parts, in the order of the recordings.
+
+    Raises `InputError` where there is no table, or it has other scenes.
+    """
+    tables = [*folder.glob("labels.*"), *sorted((folder / "labels").glob("*.*"))]
+    if not tables:
+        raise InputError(f"{folder}: expected the table labels.csv, or tables of scenes in labels/, there are none")
+    parts = [(table, read_tracks(table, labels=True)) for table in tables]
+    for table, rows in parts:
+        if others := sorted({*rows.scene.tolist()} - {*scenes}):
+            unknown = unknown_name("scene", others[0], tuple(scenes))
+            raise InputError(f"{table}: {unknown}; these are another run's labels")
+    return (
+        scene_result(scene, rows, path) for name, scene in scenes.items() for path, rows in parts if name in rows.scene
+    )
+
 
 SCAN_TIME = 0.06  # s between a moment and its scan
 WHEN = ("who", "when")  # of a correction, which do not make it another
@@ -74,12 +170,12 @@ def import_edits(
         problems += [f"{path}: {line}" for line in compared.problems]
     if len(missing) == len(results):
         raise InputError(f"{given}: expected {missing[0].name}, as written by --export {tool}")
-    lines = read_text(file).splitlines() if file.exists() else []
+    lines = correction_lines(file)
     there = [_plain(parsed_json(line, str(file))) for line in lines if line.strip()]
     new = [record for record in found if record not in there]
     about = {"who": who, "when": datetime.now(UTC).isoformat(timespec="seconds")}
     if new:
-        write_text(file, "".join(f"{line}\n" for line in [*lines, *(json.dumps({**each, **about}) for each in new)]))
+        write_correction_lines(file, [*lines, *(json.dumps({**each, **about}) for each in new)])
     return Counter(str(record["what"]) for record in new), problems
 
 

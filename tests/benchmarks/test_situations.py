@@ -8,7 +8,7 @@ import pytest
 from benchmarks.gap_figures import situation_figures
 from benchmarks.gap_runs import Judgement, LivedRun, Prediction, judgement
 from benchmarks.situations import route_of, situations_of
-from pipelines.learning.gaps import JudgedRun
+from pipelines.learning.interactions import JudgedRun
 from saga_fg import Annotations, Boxes, Detections, Frame, Scene, Tracks
 from saga_fg.learning.labelled_scene import Gap, LabelledScene
 from saga_fg.numerics.arrays import FloatArray

@@ -28,8 +28,7 @@ from benchmarks.variants import COMPONENTS, changed, contenders, variants
 from data_tools.metrics import LabelErrors
 from pipelines.cli import app as product
 from pipelines.config import Family, load_config
-from pipelines.learning.gaps import CAP, JudgedRun
-from pipelines.learning.interactions import LearnedForms
+from pipelines.learning.interactions import CAP, JudgedRun, LearnedForms
 from saga_fg import InputError
 from saga_fg.learning.labelled_scene import Gap
 from saga_fg.model.edge_rules import Following

@@ -17,15 +17,17 @@ from pipelines.cli import app
 from pipelines.config import TrackConfig, load_config, load_interactions
 from pipelines.configuration import read_settings, write_settings
 from pipelines.learning import LearnedNoise, learn_noise, learned_fragment
-from pipelines.learning.gaps import CAP, Contender, judged_on
 from pipelines.learning.interactions import (
     BASE,
+    CAP,
     LEARNED,
     NOWHERE,
     SHIPPED,
+    Contender,
     LearningSettings,
     coupled_classes,
     held_out_parts,
+    judged_on,
     learn_interactions,
 )
 from saga_fg import ConstantVelocity
@@ -41,7 +43,7 @@ from tests.saga_fg.following_pairs import RATE, following_pairs
 
 run = CliRunner().invoke
 FOLLOW = Following(CarFollowing(time_constant=float("inf")), rate=RATE, gap_scale=100.0)
-QUICK = LearningSettings(passes=1, longest=1.5)
+QUICK = LearningSettings(passes=1)
 
 
 @pytest.fixture(scope="module")

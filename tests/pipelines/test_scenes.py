@@ -14,7 +14,7 @@ from data_tools.datasets.detection_files import read_detections
 from data_tools.simulator import SimulatedTraffic, simulate_scene
 from data_tools.simulator.settings import scenario_settings
 from pipelines.config import TrackConfig, load_config
-from pipelines.learning.gaps import hidden
+from pipelines.learning.interactions import hidden
 from pipelines.tracking import track_dataset, track_scene
 from saga_fg import Boxes, Detections, Frame, Scene, Tracks
 from saga_fg.learning.labelled_scene import FOLLOWED, LENGTHS, SPACING, LabelledScene, made_gaps

@@ -19,8 +19,7 @@ from data_tools.datasets.mcap.objects import autoware_rows, message_objects
 from data_tools.datasets.mcap.recording import LoggedMessage, Topic
 from pipelines.config import load_config
 from pipelines.serving import StreamSettings, StreamTracker
-from pipelines.serving.dds import Ros2Network, payload_decoder, structure
-from pipelines.serving.ros2 import Ros2Node, result_topics, shown_tracks
+from pipelines.serving.ros2 import Ros2Network, Ros2Node, payload_decoder, result_topics, shown_tracks, structure
 from saga_fg import InputError
 from saga_fg.errors import MissingExtraError
 from tests.data_tools import mcap_example as example
@@ -253,6 +252,6 @@ def test_names_that_are_no_topics(monkeypatch):
 
 def test_without_the_extra_it_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "cyclonedds.builtin", None)
-    monkeypatch.delitem(sys.modules, "pipelines.serving.dds")
+    monkeypatch.delitem(sys.modules, "pipelines.serving.ros2")
     with pytest.raises(MissingExtraError, match=r"pip install 'saga-fg\[ros2\]'"):
-        importlib.import_module("pipelines.serving.dds")
+        importlib.import_module("pipelines.serving.ros2")

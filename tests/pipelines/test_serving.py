@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from pipelines.checks import Checks
 from pipelines.config import load_config
 from pipelines.serving import StreamSettings, StreamTracker, parse_address, serve_pipe
-from pipelines.serving.frame_order import Reordering
 from pipelines.serving.messages import FrameMessage, encode, parse_message
+from pipelines.serving.stream import Reordering
 from saga_fg import Frame, InputError, Tracks
 from saga_fg.model.edge_rules import Following
 from saga_fg.numerics.geometry import yaw_of

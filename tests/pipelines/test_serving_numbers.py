@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from pipelines.config import load_config
 from pipelines.serving import StreamSettings, StreamTracker
-from pipelines.serving.frame_order import Numbering
 from pipelines.serving.messages import encode
+from pipelines.serving.stream import Numbering
 from saga_fg import Frame, Tracks
 from tests.pipelines.running_service import COMMAND
 
