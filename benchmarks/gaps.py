@@ -1,6 +1,6 @@
 """Objects that nobody sees for some seconds, through the whole tracker on detections: identity and place.
 
-Every contender tracks every recording, with all detections and with some taken away (`pipelines.learning.interactions`).
+Every contender tracks every recording, with all detections and with some taken away.
 Intervals are paired bootstraps over recordings; those that overlap in time count as one.
 """
 

@@ -1,4 +1,4 @@
-"""Trajectories of the vehicle: formats, alignment and errors.
+"""Trajectories: formats, alignment and errors; velocities of annotated objects.
 
 Alignment of trajectories by the rigid motion with the least squared distances.
 
@@ -33,6 +33,13 @@ Trajectories in the format of the TUM RGB-D benchmark: a line a pose, with its t
 
 Seconds and metres; lines that start with # are comments. Source: Sturm et al., A benchmark for the evaluation of RGB-D
 SLAM systems, IROS 2012; https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats.
+
+Velocities of annotated objects by central differences of their positions.
+
+    v_k = (p_{k+r} - p_{k-r}) / (t_{k+r} - t_{k-r})
+
+over the annotations k of one object in order of time; at the ends of its annotations the difference is one-sided. With
+r = 1 and 1.5 s as the longest gap this is `NuScenes.box_velocity` of the nuScenes development kit.
 """
 
 from dataclasses import dataclass
@@ -49,6 +56,7 @@ from saga_fg.numerics import (
     BoolArray,
     FloatArray,
     IntArray,
+    StrArray,
     checked,
     inverse_transform,
     is_rotation,
@@ -336,3 +344,31 @@ def write_tum_poses(path: str | Path, trajectory: Trajectory) -> None:
     for time, row in zip(trajectory.timestamps.tolist(), rows, strict=True):
         lines.append(f"{time!r} " + " ".join(f"{value:.9f}" for value in row) + "\n")
     write_text(path, "".join(lines))
+
+
+def central_differences(
+    instance: StrArray, time: FloatArray, position: FloatArray, longest_gap: float, reach: int = 1
+) -> FloatArray:
+    """Velocities (N, 2), m/s, of annotations with instance names (N,), times (N,) in s, positions (N, 2) in m.
+
+    The annotations come in any order. `reach` is r above. Unknown (NaN) for an object annotated once, and where more
+    than `longest_gap` s per annotation lie between the two annotations.
+    """
+    n = len(instance)
+    velocity = np.full((n, 2), np.nan)
+    if n < 2:
+        return velocity
+    order = np.lexsort((time, instance))
+    same = instance[order][1:] == instance[order][:-1]
+    rank = np.arange(n)
+    previous: IntArray = rank - np.append(False, same)
+    following: IntArray = rank + np.append(same, False)
+    before, after = rank, rank
+    for _ in range(reach):
+        before, after = previous[before], following[after]
+    t, p = time[order], position[order]
+    elapsed = t[after] - t[before]
+    known = (elapsed > 0) & (elapsed <= longest_gap * (after - before))
+    with np.errstate(over="ignore"):  # infinite positions are refused elsewhere
+        velocity[order[known]] = (p[after] - p[before])[known] / elapsed[known, None]
+    return velocity

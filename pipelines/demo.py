@@ -10,7 +10,7 @@ from data_tools.figures import FigureTable, cell
 from data_tools.files import atomic_directory, write_text
 from data_tools.metrics import SceneMetrics, scene_metrics
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
-from data_tools.simulator.source import write_tables
+from data_tools.simulator.world import write_tables
 from pipelines.config import Method, TrackConfig, load_config
 from pipelines.configuration import write_settings
 from pipelines.report import Report, report_page, scene_of_run

@@ -23,9 +23,9 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.datasets.annotated import AnnotatedSource
-from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.source import option
 from data_tools.files import local_tree, read_table
+from data_tools.trajectories import central_differences
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import IntArray
 from saga_fg.types import Annotations, Boxes, Dataset, Scene

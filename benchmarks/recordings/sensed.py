@@ -20,9 +20,9 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.recordings.traffic import PERIOD, RecordedTraffic
-from data_tools.simulator.road_users import SimulatedTrajectories
 from data_tools.simulator.sensed_world import HEIGHT, SensedWorld
 from data_tools.simulator.settings import SensorSettings, SimulatorSettings, lidar
+from data_tools.simulator.traffic import SimulatedTrajectories
 from data_tools.simulator.world import scene_from_world
 from saga_fg.errors import InputError, unknown_name
 from saga_fg.numerics import FloatArray, yaw_transform

@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 
-from data_tools.simulator.road_users import SimulatedTrajectories
+from data_tools.simulator.traffic import SimulatedTrajectories
 from saga_fg.errors import InputError
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray
 from saga_fg.types import RoadMap

@@ -450,7 +450,7 @@ BUILT_IN: Mapping[str, str] = {
     "motchallenge": "data_tools.datasets.motchallenge:MotChallengeSource",
     "mcap": "data_tools.datasets.mcap.source:McapSource",
     "file": "data_tools.datasets.detection_file_source:DetectionFileSource",
-    "simulated": "data_tools.simulator.source:SimulatedSource",
+    "simulated": "data_tools.simulator.world:SimulatedSource",
 }
 
 

@@ -25,9 +25,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from data_tools.simulator.road import KINDS, Lanes
-from data_tools.simulator.road_users import BODY, SimulatedTrajectories
 from data_tools.simulator.scene_layout import ClosingLine
 from data_tools.simulator.settings import CLEAR_SHARE, HIDDEN_SHARE, SensorSettings, SimulatorSettings
+from data_tools.simulator.traffic import BODY, SimulatedTrajectories
 from saga_fg.numerics import BoolArray, FloatArray, StrArray, transform_points, wrap_angle, yaw_of
 from saga_fg.tracking import visible_share
 from saga_fg.types import COLOURS, Annotations, Boxes, Detections, RoadMap, road_map

@@ -14,9 +14,8 @@ from typing import Self
 
 import numpy as np
 
-from data_tools.datasets.corrections import correction_lines, write_correction_lines
+from data_tools.datasets.corrections import Edits, correction_lines, write_correction_lines
 from data_tools.datasets.detection_files import read_tracks
-from data_tools.datasets.edits import Edits
 from data_tools.datasets.given_tracks import TrackedRecordings, read_given_tracks
 from data_tools.datasets.labelling_tools import exchanged, read_from_tool, tool_format, write_for_tool
 from data_tools.datasets.results import SceneResult, scene_result

@@ -23,9 +23,8 @@ from benchmarks.recordings.landmarks import read_landmark_log
 from benchmarks.recordings.ngsim import ngsim_windows
 from benchmarks.recordings.openacc import openacc_platoons
 from data_tools.datasets.argoverse2 import ArgoverseLogs
-from data_tools.datasets.corrections import read_corrections
+from data_tools.datasets.corrections import Edits, read_corrections
 from data_tools.datasets.detection_files import read_detections, read_predictions, read_tracks, read_truth
-from data_tools.datasets.edits import Edits
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.datasets.kitti.source import read_scored_sequences
 from data_tools.datasets.labelling_tools import read_from_tool, write_for_tool

@@ -21,7 +21,7 @@ from data_tools.datasets.detection_file_source import DetectionFileSource
 from data_tools.datasets.nuscenes import read_tracking_results
 from data_tools.datasets.source import HeldScene, Part
 from data_tools.simulator import SimulatorSettings
-from data_tools.simulator.source import SimulatedScene, SimulatedSource
+from data_tools.simulator.world import SimulatedScene, SimulatedSource
 from pipelines.scale_out import (
     Job,
     LocalPool,

@@ -40,9 +40,9 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.annotated import DetectedScenes
-from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.source import AreaMap, Kind, map_points
 from data_tools.files import WHOLE, arrow_arrays, parsed_json, read_bytes
+from data_tools.trajectories import central_differences
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import FloatArray, IntArray, StrArray, checked, checked_quaternions, quaternion_rotation, yaw_of
 from saga_fg.tables import DetectionTable

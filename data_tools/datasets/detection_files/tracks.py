@@ -37,9 +37,9 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from data_tools.datasets.central_differences import central_differences
 from data_tools.datasets.detection_files.formats import Layout, read_raw_table
 from data_tools.files import atomic_file, open_bytes
+from data_tools.trajectories import central_differences
 from saga_fg.errors import InputError, MissingExtraError, error_context, unknown_name
 from saga_fg.numerics import (
     BoolArray,

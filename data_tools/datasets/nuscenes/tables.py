@@ -34,8 +34,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from data_tools.datasets.central_differences import central_differences
 from data_tools.files import JsonStream, open_json
+from data_tools.trajectories import central_differences
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import (
     FloatArray,

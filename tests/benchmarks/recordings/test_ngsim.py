@@ -12,7 +12,7 @@ from benchmarks.recordings.ngsim import ngsim_windows
 from benchmarks.recordings.sensed import true_scene
 from benchmarks.recordings.sources import TrafficScenes
 from benchmarks.recordings.traffic import SHARED_MOMENTS, RecordedTraffic, Recordings, overlapping
-from data_tools.simulator.road_users import SimulatedTrajectories
+from data_tools.simulator.traffic import SimulatedTrajectories
 from saga_fg.errors import InputError
 from saga_fg.numerics.arrays import FloatArray
 from tests.benchmarks.recordings.ngsim_example import HEADER, crossing, lanelet, rows, write_ngsim

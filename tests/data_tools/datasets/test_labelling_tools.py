@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from data_tools.datasets.edits import SAME, Edits
+from data_tools.datasets.corrections import SAME, Edits
 from data_tools.datasets.labelling_tools import exchanged, read_from_tool, write_for_tool
 from data_tools.datasets.results import SceneResult
 from data_tools.metrics import SceneBoxes

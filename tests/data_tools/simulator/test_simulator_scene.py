@@ -6,12 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from data_tools.simulator import SimulatedTraffic, camera, lidar, road_users, simulate_scene
+from data_tools.simulator import SimulatedTraffic, camera, lidar, simulate_scene, traffic
 from data_tools.simulator.road import curved_road
-from data_tools.simulator.road_users import SimulatedTrajectories, simulate_pedestrians
 from data_tools.simulator.scene_layout import sample_layout
 from data_tools.simulator.sensed_world import recently_visible, without_short_runs
 from data_tools.simulator.settings import SensorSettings, SimulatorSettings, TrafficSettings
+from data_tools.simulator.traffic import SimulatedTrajectories, simulate_pedestrians
 from data_tools.simulator.world import World, build_world, simulate_traffic
 from saga_fg.errors import InputError
 from saga_fg.types.boxes import Boxes
@@ -106,7 +106,7 @@ def test_the_ego_vehicle_is_a_car_in_traffic_and_no_object():
 
 def people(monkeypatch: pytest.MonkeyPatch, groups: int, **constants: object) -> SimulatedTrajectories:
     for name, value in constants.items():
-        monkeypatch.setattr(road_users, name, value)
+        monkeypatch.setattr(traffic, name, value)
     road = curved_road(1000.0, [], np.zeros(2), 0.0)
     time = 0.05 * np.arange(800)
     rng = np.random.default_rng(0)
