@@ -19,7 +19,6 @@ from data_tools.datasets.source import (
     DatasetSource,
     OpenedPart,
     Parts,
-    ResultFormat,
     Verb,
     file_digest,
     names,
@@ -39,12 +38,6 @@ JUDGED: tuple[Verb, ...] = ("evaluate", "evaluate labels", "report", "view")
 """Verbs that compare with true objects."""
 
 
-class FileFormat(ResultFormat):
-    """Tables."""
-
-    part_option = "table"
-
-
 @dataclass(frozen=True, kw_only=True)
 class DetectionFileSource(DatasetSource):
     """Your own detections: a table with a row for each.
@@ -60,7 +53,6 @@ class DetectionFileSource(DatasetSource):
     """
 
     name = "file"
-    written = FileFormat()
     has_truth = False
     truth_option = "--truth"
     summarised = True
@@ -108,7 +100,6 @@ class DetectionFileSource(DatasetSource):
         "YAML file with the same, for --truth alone.", None, flag="--truth-import", metavar="FILE", verbs=JUDGED
     )
     scenes: str | None = option("Scene names with commas between them; all if left out.", None)
-    table: Literal["csv", "ndjson"] = option("Format of the tables, in parallel.", "csv", verbs=("track",))
 
     def __post_init__(self) -> None:
         vars(self)["has_truth"] = self.truth is not None

@@ -81,10 +81,8 @@ def exchanged(result: SceneResult) -> SceneResult:
 def write_for_tool(path: Path, tool: str, result: SceneResult) -> int:
     """Write the boxes of a scene to a file or folder with the suffix of the tool's files; return their number."""
     scene, found = result.scene, exchanged(result).found
-    bounds = np.searchsorted(found.frame, np.arange(len(scene) + 1)).tolist()
     frames = []
-    for k, ego_T_world in enumerate(inverse_transform(scene.world_T_ego)):
-        mine = found.select(np.arange(bounds[k], bounds[k + 1]))
+    for mine, ego_T_world in zip(found.by_frame(len(scene)), inverse_transform(scene.world_T_ego), strict=True):
         boxes = mine.boxes.transformed(ego_T_world)
         numbers = np.column_stack([boxes.position, boxes.size, boxes.yaw]).tolist()
         frames.append(list(zip(mine.id.tolist(), boxes.label.tolist(), numbers, strict=True)))

@@ -29,9 +29,7 @@ from data_tools.datasets.results import Results, SceneResult, clear_figures
 from data_tools.datasets.source import (
     ChosenScenes,
     DatasetSource,
-    Parts,
     ResultFormat,
-    SourcePart,
     TrackedScenes,
     option,
 )
@@ -41,7 +39,7 @@ from data_tools.metrics.hota import SceneSimilarities, image_overlaps, similarit
 from saga_fg.errors import InputError, error_context
 from saga_fg.model import GroundCamera
 from saga_fg.numerics import FloatArray, IntArray
-from saga_fg.types import Annotations, Dataset, Frame, Scene, Tracks
+from saga_fg.types import Annotations, Frame, Scene, Tracks
 
 if TYPE_CHECKING:
     from data_tools.evaluation import Evaluation
@@ -165,12 +163,11 @@ class MotFormat(ResultFormat):
     all_tracks = "tracks"
     submission = "tracks/*.txt"
 
-    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
+    def write_tracks(self, output: Path, dataset: MotSequences, scenes: TrackedScenes) -> None:
         with atomic_directory(output, known=(TABLE, *(f"{name}.txt" for name in dataset.scenes))) as folder:
             self.write_track_part(folder / TABLE, dataset, scenes)
 
-    def write_track_part(self, part: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
-        assert isinstance(dataset, MotSequences)
+    def write_track_part(self, part: Path, dataset: MotSequences, scenes: TrackedScenes) -> None:
         kept = list(scenes)
         write_tracks(part, kept)
         for scene, moments in kept:
@@ -235,12 +232,6 @@ class MotChallengeSource(DatasetSource):
     @contextmanager
     def open(self, truth: bool = False) -> Iterator[MotSequences]:
         yield MotSequences(Path(self.folder), self.camera, truth, self.scenes)
-
-    @contextmanager
-    def parts(self) -> Iterator[Parts]:
-        with self.open() as dataset:
-            scenes = dataset.scenes
-        yield Parts(scenes, (SourcePart(self.restricted([name]), name) for name in scenes))
 
     def read_results(self, result: Path, truth: bool = True) -> Results:
         with self.open(truth) as dataset:

@@ -256,53 +256,43 @@ def input_files(source: DatasetSource) -> tuple[Path, ...]:
     return tuple(Path(place) for place in places if os.path.isfile(place))  # noqa: PTH113 (stands any text)
 
 
-def part_suffix(source: DatasetSource) -> str:
-    """Suffix of the result of one part, in parallel runs."""
-    written = source.written
-    return (
-        f".{getattr(source, written.part_option)}"
-        if written.part_option
-        else Path(written.tracks_example).suffix or ".csv"
-    )
-
-
 class ResultFormat:
     """How results are written: tables, if nothing else is said.
 
     tracks       what `track` writes, for the help; tracks_example: such a name
     merged       result of all parts in parallel, "" for none: of tracks, of labels
-    part_option  option that chooses the suffix of the result of one part, "" for that of tracks_example
     all_tracks   what holds the tracks of all parts of a parallel run, for `benchmark`; "" for none
     submission   pattern of the files that the official server takes, "" for none
     classes      that labels may have, () for any
+
+    Methods take a dataset that the `DatasetSource` of this format has opened.
     """
 
     tracks = "Table of tracks to write: .csv, .ndjson, .jsonl or .parquet (extra [parquet])."
     tracks_example = "tracks.csv"
     merged = ("", "")
-    part_option = ""
     all_tracks = ""
     submission = ""
     classes: tuple[str, ...] = ()
 
-    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
+    def write_tracks(self, output: Path, dataset: Any, scenes: TrackedScenes) -> None:
         """Write the result of tracking; it appears when all is done."""
         from data_tools.datasets.detection_files import write_tracks
 
         write_tracks(output, scenes)
 
-    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes, part: str = "") -> None:
+    def write_labels(self, folder: Path, dataset: Any, scenes: LabelledScenes, part: str = "") -> None:
         """Write labels in the dataset's own format to a folder that has the table of labels.
 
         part  name of a part of a parallel run, whose files go to folder/*/PART.*
         """
         return
 
-    def write_track_part(self, part: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
+    def write_track_part(self, part: Path, dataset: Any, scenes: TrackedScenes) -> None:
         """Write the result of one part of a parallel run, which is named for a file in a folder of its own."""
         self.write_tracks(part, dataset, scenes)
 
-    def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
+    def merge(self, output: Path, stems: Sequence[str], dataset: Any, labels: bool) -> None:
         """Join the tracks, or labels, of all parts of a parallel run to the file `merged`."""
         return
 
@@ -362,9 +352,14 @@ class DatasetSource(ABC):
 
     @contextmanager
     def parts(self) -> Iterator[Parts]:
-        """The recordings one by one, for workers; by default scenes that are read here and sent."""
+        """The recordings one by one, for workers: by default scenes that are read here and sent; scenes of a dataset
+        that says the `files` of each are read there."""
         with self.open() as dataset:
-            yield Parts(dataset.scenes, (HeldScene(dataset.scene(name)) for name in dataset.scenes), dataset)
+            names = dataset.scenes
+            if hasattr(dataset, "files"):
+                yield Parts(names, (SourcePart(self.restricted([name]), name) for name in names))
+            else:
+                yield Parts(names, (HeldScene(dataset.scene(name)) for name in names), dataset)
 
     def stream(self) -> AbstractContextManager[Iterator[Scene]] | None:
         """Recordings as successive parts of scenes, to smooth them while they are read; None to hold each in memory."""

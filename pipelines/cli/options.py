@@ -52,25 +52,43 @@ MethodOption = Annotated[
         "centre.",
     ),
 ]
-AssociationOption = Annotated[
-    AssociationName | None,
-    typer.Option(
-        "--association",
-        help="How detections are matched to tracks. hungarian: least total cost; greedy: the cheapest pair first; "
-        "graph: relative positions count as well.  [default: as configured]",
-    ),
-]
-InteractionsOption = Annotated[
-    Path | None,
-    typer.Option("--interactions", help="Edge rules from `saga-fg learn interactions`.", metavar="FILE"),
-]
 
 
 @dataclass(frozen=True)
-class TrackerOptions:
-    """Which tracker, the options of all commands that track."""
+class MethodOptions:
+    """Which method, the options of all commands that track or label."""
 
     method: MethodOption = "saga"
+    association: Annotated[
+        AssociationName | None,
+        typer.Option(
+            "--association",
+            help="How detections are matched to tracks. hungarian: least total cost; greedy: the cheapest pair first; "
+            "graph: relative positions count as well.  [default: as configured]",
+        ),
+    ] = None
+    interactions: Annotated[
+        Path | None,
+        typer.Option("--interactions", help="Edge rules from `saga-fg learn interactions`.", metavar="FILE"),
+    ] = None
+
+    def over(self, settings: TrackConfig) -> TrackConfig:
+        """The settings with these. Raises `InputError` for options that have no effect on the method."""
+        if self.method == "centerpoint" and self.association is not None:
+            raise InputError("--association: the method centerpoint has its own")
+        if self.interactions is not None:
+            if self.method != "saga":
+                raise InputError(
+                    f"--interactions {self.interactions}: goes with --method saga, {self.method} has no interactions"
+                )
+            settings = settings.with_interactions(load_interactions(self.interactions))
+        return settings.with_association(self.association)
+
+
+@dataclass(frozen=True)
+class TrackerOptions(MethodOptions):
+    """Which tracker, the options of all commands that track."""
+
     estimator: Annotated[
         str | None,
         typer.Option(
@@ -87,20 +105,17 @@ class TrackerOptions:
         float | None,
         typer.Option("--lag", min=0.0, help="Window of the fixed-lag estimator, s.  [default: as configured]"),
     ] = None
-    association: AssociationOption = None
-    interactions: InteractionsOption = None
 
     def configured(self, family: str | Path, config: Path | None) -> TrackConfig:
         """The settings of a run: the family's, the file's, then these. Raises `InputError` for those without effect."""
-        settings = with_interactions(load_config(family, config), self.method, self.interactions)
+        settings = self.over(load_config(family, config))
         if self.method == "centerpoint" and (self.estimator is not None or self.lag is not None):
             raise InputError("--estimator, --lag: the method centerpoint has no estimator")
         if self.lag is not None and "lag" not in estimator_parameters(
             settings.tracker.estimator if self.estimator is None else self.estimator
         ):
             raise InputError(f"--lag {self.lag:g}: goes with --estimator fixed-lag")
-        association_fits(self.method, self.association)
-        return settings.with_estimator(self.estimator, self.lag).with_association(self.association)
+        return settings.with_estimator(self.estimator, self.lag)
 
 
 def family_of(source: DatasetSource, config: Path | None) -> str | Path:
@@ -158,21 +173,6 @@ LearnOffsetsOption = Annotated[
         metavar="FILE",
     ),
 ]
-
-
-def association_fits(method: str, association: str | None) -> None:
-    """Raise `InputError` where --association would have no effect."""
-    if method == "centerpoint" and association is not None:
-        raise InputError("--association: the method centerpoint has its own")
-
-
-def with_interactions(config: TrackConfig, method: str, interactions: Path | None) -> TrackConfig:
-    """The configuration with learned edge rules, if a file of them is given; it has an effect on saga alone."""
-    if interactions is None:
-        return config
-    if method != "saga":
-        raise InputError(f"--interactions {interactions}: goes with --method saga, {method} has no interactions")
-    return config.with_interactions(load_interactions(interactions))
 
 
 def horizons(predict: str | None, method: Method) -> FloatArray | None:

@@ -220,12 +220,9 @@ track_app = dataset_commands("track", "Track recorded detections of a dataset.",
 
 
 @dataclass(frozen=True)
-class LabelOptions:
+class LabelOptions(options.MethodOptions):
     """How labels are made, and written."""
 
-    method: options.MethodOption = "saga"
-    association: options.AssociationOption = None
-    interactions: options.InteractionsOption = None
     tracks: Annotated[
         list[Path] | None,
         typer.Option(
@@ -259,10 +256,8 @@ def _smooth(
     tracks of other trackers are refined: joined, cut, filled and smoothed.
     """
     method = labels.method
-    options.association_fits(method, labels.association)
     settings = smoothing.load_smooth_config(source.family, config)
-    tracking = options.with_interactions(settings.tracking, method, labels.interactions)
-    settings = replace(settings, tracking=tracking.with_association(labels.association))
+    settings = replace(settings, tracking=labels.over(settings.tracking))
     options.apart(output, *(labels.tracks or ()), *([labels.corrections] if labels.corrections else ()))
     corrections = read_corrections(labels.corrections) if labels.corrections else ()
     check_classes(corrections, source.written.classes)

@@ -67,8 +67,7 @@ class JudgedRun:
 
     def __init__(self, labelled: LabelledScene, tracks: Sequence[Tracks]) -> None:
         self.labelled, self.tracks = labelled, tracks
-        truth = labelled.scene.ground_truth
-        assert truth is not None
+        truth = labelled.scene.ground_truth or ()
         self.detected = [found.select(found.coasting <= DETECTED) for found in tracks]
         self.track_of: list[dict[str, int]] = []
         for moment, found, match in zip(truth, self.detected, match_scene(truth, self.detected, GATE), strict=True):

@@ -37,7 +37,7 @@ from urllib.parse import quote
 from data_tools.datasets.corrections import write_outcomes
 from data_tools.datasets.detection_files import write_label_table, write_review
 from data_tools.datasets.given_tracks import TrackedRecordings
-from data_tools.datasets.source import DatasetSource, Part, part_suffix
+from data_tools.datasets.source import DatasetSource, Part
 from data_tools.files import parsed_json, remove_leftovers, write_bytes
 from pipelines.config import Method, TrackConfig
 from pipelines.configuration import write_settings
@@ -358,10 +358,15 @@ class TrackTask:
     horizons: FloatArray | None = None
 
     @property
+    def suffix(self) -> str:
+        """That of the result of a part."""
+        return Path(self.source.written.tracks_example).suffix or ".csv"
+
+    @property
     def configuration(self) -> str:
         """The method, the form of the results, and the settings."""
         ahead = "" if self.horizons is None else f", predicted by {self.horizons.tolist()} s"
-        head = f"# track, method {self.method}, results of {self.source.name} as {part_suffix(self.source)}{ahead}\n"
+        head = f"# track, method {self.method}, results of {self.source.name} as {self.suffix}{ahead}\n"
         head += _reading(self.source)
         return head + write_settings(self.settings, comments=False)
 
@@ -369,7 +374,7 @@ class TrackTask:
         """Write the tracks; counts frames, boxes and tracks, these also by class."""
         counts = dict.fromkeys(("frames", "tracks", "boxes"), 0)
         tracked = track_dataset(dataset, lambda: self.settings.new_tracker(self.method), horizons=self.horizons)
-        runs, part = _counted(tracked, counts), folder / "tracks" / f"{file_name(name)}{part_suffix(self.source)}"
+        runs, part = _counted(tracked, counts), folder / "tracks" / f"{file_name(name)}{self.suffix}"
         part.parent.mkdir()
         with keep_predictions(runs, part, self.horizons is not None) as kept:
             self.source.written.write_track_part(part, dataset, ((run.scene, run.tracks) for run in kept))

@@ -57,28 +57,15 @@ def _number(value: Any) -> float:
     return number
 
 
-def _whole_number(value: Any) -> int:
-    if type(value) is not int or not 0 <= value < 2**63:
-        raise TypeError
-    return value
+def _checked(valid: Callable[[Any], bool]) -> Callable[[Any], Any]:
+    """A reader that takes valid values as they are."""
 
+    def read(value: Any) -> Any:
+        if not valid(value):
+            raise TypeError
+        return value
 
-def _name(value: Any) -> str:
-    if not isinstance(value, str) or not 0 < len(value) <= LONGEST_NAME:
-        raise TypeError
-    return value
-
-
-def _list(value: Any) -> list[Any]:
-    if not isinstance(value, list):
-        raise TypeError
-    return value
-
-
-def _coordinates(value: Any) -> Coordinates:
-    if value not in get_args(Coordinates):
-        raise TypeError
-    return value  # type: ignore[no-any-return]
+    return read
 
 
 def _horizons(value: Any) -> FloatArray:
@@ -98,10 +85,15 @@ def _optional(default: float) -> Field:
     return Field(_NUMBER.expected, _number, default)
 
 
+FRAMES = get_args(Coordinates)
 POSITION, SIZE, VELOCITY = ("x", "y", "z"), ("length", "width", "height"), ("vx", "vy")
 NUMBERS = (*POSITION, *SIZE, "yaw", *VELOCITY, "score")
 _NUMBER = Field("a finite number", _number)
-_NAME = Field(f"a name of 1 to {LONGEST_NAME} characters", _name, null=False)
+_NAME = Field(
+    f"a name of 1 to {LONGEST_NAME} characters",
+    _checked(lambda value: isinstance(value, str) and 0 < len(value) <= LONGEST_NAME),
+    null=False,
+)
 DETECTION = {
     **dict.fromkeys((*NUMBERS, "range_rate"), _optional(math.nan)),
     "x": _NUMBER,
@@ -111,16 +103,18 @@ DETECTION = {
     "label": replace(_NAME, default="object"),
 }
 EGO = {"x": _NUMBER, "y": _NUMBER, "z": _optional(0.0), "yaw": _NUMBER}
-_TYPE = {"type": Field("the type of a message", _name, "frame")}
+_TYPE = {"type": Field("the type of a message", _NAME.read, "frame")}
 MESSAGES: Mapping[str, Mapping[str, Field]] = {
     "frame": {
         **_TYPE,
-        "seq": Field("an integer from 0 on", _whole_number, None),
+        "seq": Field("an integer from 0 on", _checked(lambda value: type(value) is int and 0 <= value < 2**63), None),
         "timestamp": _NUMBER,
         "sensor": replace(_NAME, default="sensor"),
-        "coordinates": Field(f"one of {', '.join(get_args(Coordinates))}", _coordinates, "world", null=False),
+        "coordinates": Field(
+            f"one of {', '.join(FRAMES)}", _checked(lambda value: value in FRAMES), "world", null=False
+        ),
         "ego": Field("an object with x, y and yaw", _pose, None),
-        "detections": Field("a list", _list),
+        "detections": Field("a list", _checked(lambda value: isinstance(value, list))),
     },
     "status": _TYPE,
     "subscribe": _TYPE,

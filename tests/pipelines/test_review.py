@@ -295,7 +295,7 @@ def test_a_failure_while_writing_changes_nothing(server, labels, monkeypatch):
     def fail(path: Path, content: str) -> None:
         raise InputError(f"{path}: not written: disk full")
 
-    monkeypatch.setattr("pipelines.review.server.write_text", fail)
+    monkeypatch.setattr("data_tools.datasets.corrections.write_text", fail)
     status, answer = client.correct(what="exists", at=at(1.0, 20.0, 8.0), value=False, scene="a")
     assert (status, answer["error"]) == (422, f"{labels / CORRECTIONS}: not written: disk full")
     assert client.state("a") == before
@@ -303,7 +303,7 @@ def test_a_failure_while_writing_changes_nothing(server, labels, monkeypatch):
     def crash(path: Path, content: str) -> None:
         raise RuntimeError("anything")
 
-    monkeypatch.setattr("pipelines.review.server.write_text", crash)
+    monkeypatch.setattr("data_tools.datasets.corrections.write_text", crash)
     status, answer = client.correct(what="exists", at=at(1.0, 20.0, 8.0), value=False, scene="a")
     assert (status, answer["error"]) == (500, "RuntimeError: anything")
     assert client.state("a") == before

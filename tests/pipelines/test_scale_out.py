@@ -17,7 +17,6 @@ from pathlib import Path
 
 import pytest
 
-from data_tools.datasets.detection_file_source import DetectionFileSource
 from data_tools.datasets.nuscenes import read_tracking_results
 from data_tools.datasets.source import HeldScene, Part
 from data_tools.simulator import SimulatorSettings
@@ -87,8 +86,6 @@ def test_other_settings_or_another_method_do_everything_again(tmp_path):
     other = replace(CONFIG, tracker=replace(CONFIG.tracker, report_coasting=0.0))
     for task in (replace(TRACK, settings=other), replace(TRACK, method="kf"), TRACK):
         assert run(inputs, output, task).done == ["a00", "a01"]
-    run(inputs, output, replace(TRACK, source=DetectionFileSource(table="ndjson")))
-    assert list(content(output)) == ["a00.ndjson", "a01.ndjson"]  # results of an earlier form do not stay behind
 
 
 def test_the_manifest_says_how_a_result_came_about(tmp_path):

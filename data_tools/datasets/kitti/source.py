@@ -54,9 +54,7 @@ from data_tools.datasets.source import (
     TRACKING,
     DatasetSource,
     LabelledScenes,
-    Parts,
     ResultFormat,
-    SourcePart,
     Surroundings,
     TrackedScenes,
     names,
@@ -80,7 +78,7 @@ from data_tools.metrics import (
 )
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import FloatArray, IntArray, inverse_transform
-from saga_fg.types import Dataset, Scene, Tracks, known_velocities
+from saga_fg.types import Scene, Tracks, known_velocities
 
 if TYPE_CHECKING:
     from saga_fg.smoothing import Labels
@@ -212,8 +210,14 @@ def result_sequences(result: str | Path) -> tuple[str, ...]:
 
 def scored_sequences(result: str | Path, dataset: KittiTracking) -> dict[str, ScoredSequence]:
     """The sequences of a dataset with ground truth, each with its result; raises as `read_scored_sequences` does."""
-    folder, table = Path(result), _table_of(Path(result))
-    return {name: _scored(folder / f"{name}.txt", name, dataset, table) for name in dataset.scenes}
+    folder, table, scored = Path(result), _table_of(Path(result)), {}
+    for name in dataset.scenes:
+        scene = dataset.scene(name)
+        lines, found = placed_result(folder / f"{name}.txt", scene, dataset)
+        found = found if table is None else _with_motion(found, table, name)
+        truth = SceneBoxes.of_annotations(scene.ground_truth or ())
+        scored[name] = ScoredSequence(scene, found, dataset.labels(name), lines, truth)
+    return scored
 
 
 def _table_of(folder: Path) -> TrackRows | None:
@@ -221,16 +225,6 @@ def _table_of(folder: Path) -> TrackRows | None:
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder with results NNNN.txt")
     return read_tracks(folder / TRACK_TABLE) if (folder / TRACK_TABLE).exists() else None
-
-
-def _scored(path: Path, name: str, dataset: KittiTracking, table: TrackRows | None) -> ScoredSequence:
-    scene = dataset.scene(name)
-    result, found = placed_result(path, scene, dataset)
-    if table is not None:
-        found = _with_motion(found, table, name)
-    assert scene.ground_truth is not None
-    truth = SceneBoxes.of_annotations(scene.ground_truth)
-    return ScoredSequence(scene, found, dataset.labels(name), result, truth)
 
 
 def placed_result(path: Path, scene: Scene, dataset: KittiTracking) -> tuple[KittiObjects, SceneBoxes]:
@@ -368,20 +362,17 @@ class KittiFormat(ResultFormat):
     submission = "tracks/[0-9]*.txt"
     merged = (f"tracks/{TRACK_TABLE}", f"results/{TRACK_TABLE}")
 
-    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
-        assert isinstance(dataset, KittiTracking)
+    def write_tracks(self, output: Path, dataset: KittiTracking, scenes: TrackedScenes) -> None:
         write_kitti_results(output, dataset, scenes)
 
-    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes, part: str = "") -> None:
-        assert isinstance(dataset, KittiTracking)
+    def write_labels(self, folder: Path, dataset: KittiTracking, scenes: LabelledScenes, part: str = "") -> None:
         write_kitti_labels(folder / "label_02", dataset, scenes)
         write_kitti_results(folder / "results", dataset, tracks_of(scenes), f"{part}.csv" if part else TRACK_TABLE)
 
-    def write_track_part(self, part: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
-        assert isinstance(dataset, KittiTracking)
+    def write_track_part(self, part: Path, dataset: KittiTracking, scenes: TrackedScenes) -> None:
         write_kitti_results(part.parent, dataset, scenes, part.name)
 
-    def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
+    def merge(self, output: Path, stems: Sequence[str], dataset: KittiTracking | None, labels: bool) -> None:
         merged = output / self.merged[labels]
         merge_tables(merged, [merged.parent / f"{stem}.csv" for stem in stems])
 
@@ -405,12 +396,6 @@ class KittiSource(DatasetSource):
     def open(self, truth: bool = False) -> Iterator[KittiTracking]:
         with local_kitti(self.dataroot, self.detections, self._chosen(), truth) as dataset:
             yield dataset
-
-    @contextmanager
-    def parts(self) -> Iterator[Parts]:
-        with self.open() as dataset:
-            scenes = dataset.scenes
-        yield Parts(scenes, (SourcePart(self.restricted([name]), name) for name in scenes))
 
     def surroundings(self, scenes: Mapping[str, Scene]) -> Surroundings:
         if is_url(self.dataroot):

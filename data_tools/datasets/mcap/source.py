@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -111,13 +111,11 @@ class McapFormat(ResultFormat):
 
     tracks = "File to write: .mcap for messages of the type that the detections have; a table: .csv, .ndjson, .parquet."
     tracks_example = "tracks.mcap"
-    part_option = "table"
 
-    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
+    def write_tracks(self, output: Path, dataset: McapRecording, scenes: TrackedScenes) -> None:
         if output.suffix != ".mcap":
             super().write_tracks(output, dataset, scenes)
             return
-        assert isinstance(dataset, McapRecording)
         write_track_messages(output, dataset, scenes)
 
 
@@ -161,7 +159,6 @@ class McapSource(DatasetSource):
         metavar="FILE|TOPIC",
         verbs=JUDGED,
     )
-    table: Literal["mcap", "csv", "ndjson"] = option("Format of the results, in parallel.", "mcap", verbs=("track",))
 
     def __post_init__(self) -> None:
         vars(self)["has_truth"] = self.truth is not None
@@ -257,5 +254,5 @@ class McapPart:
         """Open with the digests of the files, and of the options."""
         dataset = self.source.recorded()
         digests = {file.name: file_digest(file) for file in dataset.files}
-        options = sha256(repr((dataset.options, self.source.table)).encode()).hexdigest()
+        options = sha256(repr(dataset.options).encode()).hexdigest()
         yield OpenedPart({**digests, "options": options}, lambda: dataset)

@@ -54,7 +54,7 @@ from data_tools.metrics import (
 )
 from saga_fg.errors import InputError
 from saga_fg.numerics import FloatArray
-from saga_fg.types import Annotations, Boxes, Dataset, Scene
+from saga_fg.types import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,25 +85,15 @@ def read_scored_scenes(
     for name in dataset.scenes:
         scene = dataset.scene(name)
         truth = scene.ground_truth or ()
-        tracking = _scored(str(result), scene, truth, [each.boxes for each in racks[name]], found)
+        tracking = NuScenesTrackingScene(
+            timestamps=scene.timestamps,
+            ego_position=scene.world_T_ego[:, :2, 3],
+            truth=SceneBoxes.of_annotations(truth, hidden=False),
+            found=_found(str(result), scene, found),
+            racks=[each.boxes for each in racks[name]],
+        )
         scored[name] = ScoredScene(scene, tracking.found, tracking)
     return scored
-
-
-def _scored(
-    path: str,
-    scene: Scene,
-    truth: Sequence[Annotations],
-    racks: Sequence[Boxes],
-    samples: Mapping[str, ResultBoxes],
-) -> NuScenesTrackingScene:
-    return NuScenesTrackingScene(
-        timestamps=scene.timestamps,
-        ego_position=scene.world_T_ego[:, :2, 3],
-        truth=SceneBoxes.of_annotations(truth, hidden=False),
-        found=_found(path, scene, samples),
-        racks=racks,
-    )
 
 
 def _found(path: str, scene: Scene, found: Mapping[str, ResultBoxes]) -> SceneBoxes:
@@ -182,23 +172,20 @@ class NuScenesFormat(ResultFormat):
     all_tracks = submission = "tracks.json"
     classes = tuple(CATEGORY_OF_CLASS)
 
-    def write_tracks(self, output: Path, dataset: Dataset, scenes: TrackedScenes) -> None:
-        assert isinstance(dataset, NuScenes | HeldScene)
+    def write_tracks(self, output: Path, dataset: NuScenes | HeldScene, scenes: TrackedScenes) -> None:
         write_tracking_results(output, scenes, dataset.meta)
 
-    def write_labels(self, folder: Path, dataset: Dataset, scenes: LabelledScenes, part: str = "") -> None:
+    def write_labels(self, folder: Path, dataset: NuScenes, scenes: LabelledScenes, part: str = "") -> None:
         if part:
             for kind in ("tracking", "objects"):
                 (folder / kind).mkdir()
             self.write_tracks(folder / "tracking" / f"{part}.json", dataset, tracks_of(scenes))
             write_label_part(folder / "objects" / f"{part}.ndjson", scenes)
             return
-        assert isinstance(dataset, NuScenes)
         self.write_tracks(folder / self.merged[1], dataset, tracks_of(scenes))
         write_nuscenes_labels(folder, dataset.dataroot, dataset.version, scenes)
 
-    def merge(self, output: Path, stems: Sequence[str], dataset: Dataset | None, labels: bool) -> None:
-        assert isinstance(dataset, NuScenes)
+    def merge(self, output: Path, stems: Sequence[str], dataset: NuScenes, labels: bool) -> None:
         parts = (output / ("tracking" if labels else "tracks") / f"{stem}.json" for stem in stems)
         merge_tracking_results(output / self.merged[labels], parts, dataset.meta)
         if labels:
