@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.datasets.annotated import AnnotatedSource
+from data_tools.datasets.given_tracks import AnnotatedSource
 from data_tools.datasets.source import option
 from data_tools.files import local_tree, read_table
 from data_tools.trajectories import central_differences

@@ -33,7 +33,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from data_tools.datasets.annotated import detected
+from data_tools.datasets.given_tracks import detected
 from data_tools.datasets.source import DatasetSource
 from data_tools.figures import FigureTable, cell
 from data_tools.metrics.scene import match_scene

@@ -6,7 +6,7 @@
 `StateKeeper` keeps the state in a file. `ros2.Ros2Node` gives frames of ROS 2's messages to the same stream.
 """
 
-from pipelines.serving.client import StreamClient
+from pipelines.serving.messages import StreamClient
 from pipelines.serving.server import SocketServer, StopRequest, serve_pipe
 from pipelines.serving.settings import Address, StreamSettings, parse_address
 from pipelines.serving.state import StateKeeper

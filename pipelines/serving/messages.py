@@ -13,19 +13,24 @@ out  tracks     the answer to a frame
      predictions  the answer to `predict`
      status, reset, subscribe   the answers to the other requests
      error      a message that could not be used, and why; nothing else happened
+
+`StreamClient` is a small client, for Python programs and for `saga-fg status`.
 """
 
 import json
 import math
 import re
+import socket
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
-from typing import Any, NoReturn, get_args
+from types import TracebackType
+from typing import Any, NoReturn, Self, get_args
 
 import numpy as np
 
-from pipelines.serving.settings import StreamSettings
+from pipelines.serving.settings import Address, StreamSettings
 from saga_fg import Boxes, Detections, Frame, InputError, PredictedTracks, Tracks
 from saga_fg.numerics import FloatArray, yaw_transform
 from saga_fg.types import Coordinates, checked_horizons
@@ -329,3 +334,70 @@ def _refuse_constant(name: str) -> NoReturn:
 def _short(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 40 else text[:37] + "..."
+
+
+class StreamClient:
+    """A connection to a service; a context manager.
+
+    Raises `InputError` where no service listens, and `ConnectionError` when the service goes away.
+    """
+
+    def __init__(self, address: Address, timeout: float | None = 30.0) -> None:
+        family = (
+            socket.AF_UNIX if address.path is not None else socket.AF_INET6 if ":" in address.host else socket.AF_INET
+        )
+        self._address = address
+        self._socket = socket.socket(family)
+        self._socket.settimeout(timeout)
+        try:
+            self._connect(timeout)
+        except OSError as error:
+            self._socket.close()
+            raise InputError(f"{address}: nobody answers there: {error.strerror or error}") from error
+        self._lines = self._socket.makefile("rb")
+
+    def _connect(self, timeout: float | None) -> None:
+        where = str(self._address.path) if self._address.path is not None else (self._address.host, self._address.port)
+        end = time.monotonic() + (timeout or 0.0)
+        while True:
+            try:
+                return self._socket.connect(where)
+            except BlockingIOError:  # as many others wait to be accepted at this Unix socket as may
+                if time.monotonic() > end:
+                    raise
+                time.sleep(0.01)
+
+    def send(self, message: Mapping[str, Any] | bytes) -> None:
+        """Send one message, or a raw line."""
+        self._socket.sendall(message if isinstance(message, bytes) else encode(message))
+
+    def receive(self) -> dict[str, Any]:
+        """Return the next answer. Raises `InputError` for a line that is no JSON object."""
+        line = self._lines.readline()
+        if not line:
+            raise ConnectionError("the service has closed the connection")
+        try:
+            answer = json.loads(line)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{self._address}: expected an answer in JSON, got {line[:80]!r}") from error
+        if not isinstance(answer, dict):
+            raise InputError(f"{self._address}: expected an object as answer, got {line[:80]!r}")
+        return answer
+
+    def ask(self, message: Mapping[str, Any]) -> dict[str, Any]:
+        """Send one message; return the next answer."""
+        self.send(message)
+        return self.receive()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._lines.close()
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -39,7 +39,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.annotated import DetectedScenes
+from data_tools.datasets.given_tracks import DetectedScenes
 from data_tools.datasets.source import AreaMap, Kind, map_points
 from data_tools.files import WHOLE, arrow_arrays, parsed_json, read_bytes
 from data_tools.trajectories import central_differences

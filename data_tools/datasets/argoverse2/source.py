@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.annotated import AnnotatedSource
 from data_tools.datasets.argoverse2.logs import (
     CLASSES,
     FILES,
@@ -40,6 +39,7 @@ from data_tools.datasets.argoverse2.logs import (
     transforms,
 )
 from data_tools.datasets.detection_files import TrackRows, read_detections
+from data_tools.datasets.given_tracks import AnnotatedSource
 from data_tools.datasets.results import Results, scene_result
 from data_tools.datasets.source import ChosenScenes, ResultFormat, Surroundings, TrackedScenes, option
 from data_tools.files import arrow_arrays, atomic_file, is_url, local_copy, local_tree

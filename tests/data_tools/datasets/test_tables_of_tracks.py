@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from benchmarks.recordings.eth_ucy import EthUcySource
-from data_tools.datasets.annotated import detected
 from data_tools.datasets.detection_files import (
     LABEL_COLUMNS,
     read_detections,
@@ -15,6 +14,7 @@ from data_tools.datasets.detection_files import (
     write_label_table,
     write_tracks,
 )
+from data_tools.datasets.given_tracks import detected
 from data_tools.datasets.nuscenes import NuScenes, write_nuscenes
 from data_tools.datasets.nuscenes.writer import write_nuscenes_labels
 from data_tools.datasets.source import input_files
