@@ -22,8 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.evaluation import placed_detections
-from data_tools.metrics import SceneBoxes
+from data_tools.metrics import SceneBoxes, placed_detections
 from data_tools.metrics.scene_boxes import nearest_pairs
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, wrap_angle
 from saga_fg.smoothing import LabelBuilder, Labels, Probabilities, RecordingLabels

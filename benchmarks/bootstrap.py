@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from data_tools.metrics import ErrorSample
 from saga_fg.errors import InputError
 from saga_fg.numerics import FloatArray, checked
 
@@ -58,6 +59,11 @@ def difference(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(a - b)
 
 
+def square_sums(errors: ErrorSample) -> tuple[float, float]:
+    """(sum of squares, number of values), the sums for a bootstrap of the RMSE."""
+    return float(np.sum(errors.values**2)), float(len(errors))
+
+
 def paired_bootstrap(
     a: ArrayLike,
     b: ArrayLike,
@@ -70,7 +76,7 @@ def paired_bootstrap(
 ) -> Interval:
     """Interval of `compare(statistic(sums of a), statistic(sums of b))` over the same S scenes.
 
-    a, b       (S, m) sums of each scene, for instance `ErrorSample.square_sums`
+    a, b       (S, m) sums of each scene, for instance `square_sums`
     statistic  maps totals (..., m) to values (...); must work on stacks of totals
 
     Samples in which the statistic is undefined (all their scenes are empty) are left out; NaN if there are no others.

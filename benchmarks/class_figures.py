@@ -21,8 +21,13 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.nuscenes.source import in_range
-from data_tools.evaluation import PlacedBoxes, best_thresholds
-from data_tools.metrics import NuScenesTrackingScene, SceneBoxes, nuscenes_tracking_metrics
+from data_tools.metrics import (
+    NuScenesTrackingScene,
+    PlacedBoxes,
+    SceneBoxes,
+    best_thresholds,
+    nuscenes_tracking_metrics,
+)
 from data_tools.metrics.scene_boxes import near_pairs, nearest_pairs
 from saga_fg.numerics import BoolArray, FloatArray, StrArray
 from saga_fg.types import paired_bev_iou, touching_pairs

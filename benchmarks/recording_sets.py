@@ -28,7 +28,6 @@ from data_tools.datasets.kitti.source import CLASSES, kitti_label_errors, read_s
 from data_tools.datasets.nuscenes import NuScenes, read_scored_scenes, split_scenes, write_tracking_results
 from data_tools.datasets.nuscenes.source import nuscenes_label_errors
 from data_tools.datasets.source import ChosenScenes
-from data_tools.evaluation import placed_detections
 from data_tools.metrics import (
     KittiTrackingSequence,
     LabelErrors,
@@ -37,6 +36,7 @@ from data_tools.metrics import (
     kitti_tracking_metrics,
     label_errors,
     nuscenes_tracking_metrics,
+    placed_detections,
     scene_metrics,
 )
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings

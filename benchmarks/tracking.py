@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.bootstrap import Interval, paired_bootstrap
+from benchmarks.bootstrap import Interval, paired_bootstrap, square_sums
 from benchmarks.recording_sets import RecordingOptions, RecordingSet, Score, chosen_sets
 from benchmarks.runner import Data, Row, Rows, clocked, each, resampled
 from benchmarks.variants import COMPONENTS, SHIPPED, contenders
@@ -103,7 +103,7 @@ def changes(score: Score, base: Score, units: Sequence[Sequence[int]], draws: in
     result: dict[str, Interval] = resampled(figures, units, draws)
     for name in ERRORS:
         a, b = (
-            [np.sum([one.errors[row].sample(name).square_sums for row in unit], axis=0) for unit in units]
+            [np.sum([square_sums(one.errors[row].sample(name)) for row in unit], axis=0) for unit in units]
             for one in (score, base)
         )
         result[f"{name} RMSE"] = paired_bootstrap(a, b)

@@ -29,25 +29,25 @@ from data_tools.metrics import (
     LabelErrors,
     NuScenesClassMetrics,
     NuScenesTrackingMetrics,
-    NuScenesTrackingScene,
-    NuScenesTrackingSettings,
     RecallCurves,
     SceneBoxes,
     SceneMetrics,
+    best_thresholds,
     calibration,
     coverages,
     error_summary,
     errors_by_class,
     hota_metrics,
     label_errors,
-    nuscenes_tracking_metrics,
+    placed_detections,
     scene_metrics_by_label,
+    score_sweep,
 )
 from data_tools.metrics.hota import Similarity
 from saga_fg.errors import InputError
 from saga_fg.numerics import FloatArray, IntArray, StrArray
 from saga_fg.parts import new_part, of_own_code, part_kind
-from saga_fg.types import Boxes, Scene, html_table, text_table
+from saga_fg.types import Scene, html_table, text_table
 
 __all__ = [
     "Evaluation",
@@ -270,35 +270,10 @@ _SWEEP_COLUMNS = (
 )
 
 
-def score_sweep(pairs: Sequence[tuple[Scene, SceneBoxes]]) -> NuScenesTrackingMetrics:
-    """Score the tracks of scenes with ground truth by the metrics of the task: all classes, at any distance.
-
-    Hidden objects are left out. A frame counts as one median step of time in TID and LGD.
-    """
-    scenes = []
-    for scene, found in pairs:
-        truth = SceneBoxes.of_annotations(scene.ground_truth or (), hidden=False)
-        scenes.append(NuScenesTrackingScene(scene.timestamps, np.zeros((len(scene), 2)), truth, found))
-    labels = sorted({label for each in scenes for t in (each.truth, each.found) for label in t.boxes.label.tolist()})
-    steps = np.concatenate([np.empty(0), *(np.diff(each.timestamps) for each in scenes)])
-    period = float(np.median(steps)) if len(steps) else 1.0
-    settings = NuScenesTrackingSettings(class_range=dict.fromkeys(labels, np.inf), sample_period=period)
-    return nuscenes_tracking_metrics(scenes, settings)
-
-
 def sweep_table(title: str, metrics: NuScenesTrackingMetrics) -> FigureTable:
     """The figures of the task, a row for all classes and one for each."""
     rows = [("overall", metrics.overall), *metrics.per_class.items()]
     return FigureTable(title, _SWEEP_COLUMNS, tuple((name, *_sweep_cells(figures)) for name, figures in rows))
-
-
-def best_thresholds(metrics: NuScenesTrackingMetrics) -> dict[str, float]:
-    """The score threshold of best MOTA of each class that occurs; infinite for one that is never matched."""
-    best = {}
-    for label, curves in metrics.curves.items():
-        reached = np.where(np.isfinite(curves.score), curves.mota, -np.inf)
-        best[label] = float(curves.score[np.argmax(reached)]) if np.isfinite(curves.score).any() else np.inf
-    return best
 
 
 def _sweep_cells(f: NuScenesClassMetrics) -> tuple[str, ...]:
@@ -512,15 +487,3 @@ def _figures(m: SceneMetrics) -> dict[str, float]:
     samples = {"position": m.position, "velocity": m.velocity, "heading": m.heading, "carried": m.carried}
     samples |= {"hidden_position": m.hidden_position, "hidden_velocity": m.hidden_velocity}
     return figures | {f"{name}_rmse": sample.rmse for name, sample in samples.items()}
-
-
-PlacedBoxes = tuple[IntArray, Boxes]
-"""(moment (N,), boxes (N))"""
-
-
-def placed_detections(scene: Scene) -> PlacedBoxes:
-    """The boxes of all frames that were taken at a moment of the scene, in the frames' coordinates (world)."""
-    moment_of = {time: k for k, time in enumerate(scene.timestamps.tolist())}
-    frames = [(moment_of[frame.timestamp], frame) for frame in scene.frames if frame.timestamp in moment_of]
-    moment = np.repeat(np.array([k for k, _ in frames], dtype=np.int64), [len(frame) for _, frame in frames])
-    return moment, Boxes.concatenate([frame.detections.boxes for _, frame in frames])

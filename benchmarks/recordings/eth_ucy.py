@@ -22,9 +22,10 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.datasets.given_tracks import AnnotatedSource
-from data_tools.datasets.source import option
-from data_tools.files import local_tree, read_table
+from data_tools.datasets.detection_files import read_detections
+from data_tools.datasets.given_tracks import DetectedScenes
+from data_tools.datasets.source import ChosenScenes, DatasetSource, option
+from data_tools.files import local_copy, local_tree, read_table
 from data_tools.trajectories import central_differences
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import IntArray
@@ -101,14 +102,31 @@ def _frame_rate(name: str, frame: IntArray) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EthUcySource(AnnotatedSource):
-    """Walking pedestrians of ETH and UCY, annotated every 0.4 s."""
+class EthUcySource(DatasetSource):
+    """Walking pedestrians of ETH and UCY, annotated every 0.4 s.
+
+    Without a table, detections are the boxes without identities and velocities.
+    """
 
     name = "benchmarks.recordings:EthUcySource"
     example = "--dataroot data/eth_ucy --scenes hotel"
     dataroot: str = option("Folder that holds eth/ and hotel/ or files NAME.txt, or its URL; or one such file.")
 
+    detections: str | None = option(
+        "Table of detections (.csv, .ndjson, .jsonl, .npz), s from the recording's first moment; without it, what is "
+        "annotated and visible is detected, without identities and velocities.",
+        None,
+        metavar="TABLE",
+    )
+    scenes: str | None = option("Recordings with commas between them; all if left out.", None)
+
     @contextmanager
-    def annotated(self) -> Iterator[Dataset]:
+    def open(self, truth: bool = False) -> Iterator[Dataset]:
         with local_tree(self.dataroot, ["*/obsmat.txt", "*.txt"]) as root:
-            yield EthUcy(root)
+            recordings: Dataset = EthUcy(root)
+            dataset = recordings if self.scenes is None else ChosenScenes(recordings, self.scenes)
+            if self.detections is None:
+                yield DetectedScenes(dataset, None)
+            else:
+                with local_copy(self.detections) as path:
+                    yield DetectedScenes(dataset, read_detections(path))

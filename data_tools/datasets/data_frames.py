@@ -7,7 +7,8 @@ from pathlib import Path
 
 from data_tools.datasets.detection_file_source import DetectedTruth
 from data_tools.datasets.detection_files import TrackRows, TruthTable, track_rows
-from data_tools.datasets.detection_files.tracks import OWN, REQUIRED, TRUTH_COLUMNS
+from data_tools.datasets.detection_files.dataset import TRUTH_COLUMNS
+from data_tools.datasets.detection_files.tracks import OWN, TRACK_REQUIRED
 from data_tools.datasets.results import Results, SceneResult, clear_figures, table_results
 from data_tools.evaluation import Evaluation, Metric
 from saga_fg.tables import NAME, SETTLED, TRACK_COLUMNS, DetectionTable, Table, TableImport, raw_table, tell
@@ -54,7 +55,7 @@ def found_results(
     if detections is not None:
         dataset = DetectionTable(raw_table(detections, how))
     if truth is not None:
-        raw = raw_table(truth, truth_how or how, TRUTH_COLUMNS, REQUIRED)
+        raw = raw_table(truth, truth_how or how, TRUTH_COLUMNS, TRACK_REQUIRED)
         true = TruthTable.from_table(raw, partial(tell, depth=_DEPTH))
         dataset = true if dataset is None else DetectedTruth(true, dataset)
     return table_results(
@@ -63,4 +64,4 @@ def found_results(
 
 
 def _rows(tracks: Table, how: TableImport | None) -> TrackRows:
-    return track_rows(raw_table(tracks, how, (*TRACK_COLUMNS, SETTLED), REQUIRED), partial(tell, depth=_DEPTH))
+    return track_rows(raw_table(tracks, how, (*TRACK_COLUMNS, SETTLED), TRACK_REQUIRED), partial(tell, depth=_DEPTH))

@@ -7,27 +7,22 @@ table says so (`coasting`).
 Recordings that have ground truth and no detections take these from a table, or from the annotations.
 """
 
-from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from data_tools.datasets.detection_files import read_detections
 from data_tools.datasets.results import SceneResult
 from data_tools.datasets.source import (
-    ChosenScenes,
     DatasetSource,
     HeldScene,
     OpenedPart,
     Part,
     Parts,
-    option,
     scene_digests,
 )
-from data_tools.files import local_copy
 from saga_fg.errors import InputError
 from saga_fg.tables import DetectionTable
 from saga_fg.types import Dataset, Detections, Frame, Scene
@@ -173,33 +168,6 @@ def tracked_parts(parts: Parts, results: GivenTracks) -> Parts:
 
 
 ANNOTATED = "annotations"
-
-
-@dataclass(frozen=True, kw_only=True)
-class AnnotatedSource(DatasetSource):
-    """Annotated recordings; without a table, detections are the visible boxes without identities and velocities."""
-
-    detections: str | None = option(
-        "Table of detections (.csv, .ndjson, .jsonl, .npz), s from the recording's first moment; without it, what is "
-        "annotated and visible is detected, without identities and velocities.",
-        None,
-        metavar="TABLE",
-    )
-    scenes: str | None = option("Recordings with commas between them; all if left out.", None)
-
-    @abstractmethod
-    def annotated(self) -> AbstractContextManager[Dataset]:
-        """The recordings with their ground truth, without frames."""
-
-    @contextmanager
-    def open(self, truth: bool = False) -> Iterator[Dataset]:
-        with self.annotated() as recordings:
-            dataset = recordings if self.scenes is None else ChosenScenes(recordings, self.scenes)
-            if self.detections is None:
-                yield DetectedScenes(dataset, None)
-            else:
-                with local_copy(self.detections) as path:
-                    yield DetectedScenes(dataset, read_detections(path))
 
 
 class DetectedScenes:

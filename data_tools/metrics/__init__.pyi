@@ -11,6 +11,7 @@ from .label_errors import (
     ErrorSample,
     ErrorSummary,
     LabelErrors,
+    PlacedBoxes,
     calibration,
     coverage,
     coverages,
@@ -19,13 +20,16 @@ from .label_errors import (
     label_errors,
     label_velocities,
     nees,
+    placed_detections,
 )
 from .nuscenes_sweep import NuScenesClassMetrics, RecallCurves
 from .nuscenes_tracking import (
     NuScenesTrackingMetrics,
     NuScenesTrackingScene,
     NuScenesTrackingSettings,
+    best_thresholds,
     nuscenes_tracking_metrics,
+    score_sweep,
 )
 from .scene import FrameMatch, SceneMetrics, match_scene, scene_metrics, scene_metrics_by_label
 from .scene_boxes import SceneBoxes
@@ -44,9 +48,11 @@ __all__ = [
     "NuScenesTrackingMetrics",
     "NuScenesTrackingScene",
     "NuScenesTrackingSettings",
+    "PlacedBoxes",
     "RecallCurves",
     "SceneBoxes",
     "SceneMetrics",
+    "best_thresholds",
     "calibration",
     "coverage",
     "coverages",
@@ -60,6 +66,8 @@ __all__ = [
     "match_scene",
     "nees",
     "nuscenes_tracking_metrics",
+    "placed_detections",
     "scene_metrics",
     "scene_metrics_by_label",
+    "score_sweep",
 ]

@@ -44,7 +44,7 @@ from saga_fg.numerics import (
     chi_square_quantile,
     wrap_angle,
 )
-from saga_fg.types import Boxes
+from saga_fg.types import Boxes, Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +81,6 @@ class ErrorSample:
     @property
     def median(self) -> float:
         return float(np.median(self.values)) if len(self) else float("nan")
-
-    @property
-    def square_sums(self) -> tuple[float, float]:
-        """(sum of squares, number of values), the sums for a bootstrap of the RMSE."""
-        return float(np.sum(self.values**2)), float(len(self))
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -310,3 +305,15 @@ def errors_by_class(errors: LabelErrors) -> dict[str, LabelErrors]:
     """The errors of each class with labels, preceded by those of all classes."""
     labels = np.unique(errors.label).tolist()
     return {OVERALL: errors, **{label: errors.select(errors.label == label) for label in labels}}
+
+
+PlacedBoxes = tuple[IntArray, Boxes]
+"""(moment (N,), boxes (N))"""
+
+
+def placed_detections(scene: Scene) -> PlacedBoxes:
+    """The boxes of all frames that were taken at a moment of the scene, in the frames' coordinates (world)."""
+    moment_of = {time: k for k, time in enumerate(scene.timestamps.tolist())}
+    frames = [(moment_of[frame.timestamp], frame) for frame in scene.frames if frame.timestamp in moment_of]
+    moment = np.repeat(np.array([k for k, _ in frames], dtype=np.int64), [len(frame) for _, frame in frames])
+    return moment, Boxes.concatenate([frame.detections.boxes for _, frame in frames])

@@ -29,7 +29,7 @@ from data_tools.metrics.scene_boxes import SceneBoxes
 from saga_fg.errors import InputError
 from saga_fg.numerics import FloatArray, checked
 from saga_fg.settings import setting, settings_group
-from saga_fg.types import Boxes
+from saga_fg.types import Boxes, Scene
 
 _MIN_RECALL = 0.1  # lowest recall of the sweep
 _RECALLS = 40  # values of recall in the sweep; this and the gate as in `tracking_nips_2019`
@@ -227,3 +227,28 @@ def _summary(columns: Mapping[str, FloatArray]) -> NuScenesClassMetrics:
 def _curves(columns: Mapping[str, FloatArray], recalls: FloatArray, thresholds: FloatArray) -> RecallCurves:
     shown = {field.name: columns[field.name] for field in fields(RecallCurves) if field.name in columns}
     return RecallCurves(hypothetical_recall=recalls.copy(), score=thresholds, **shown)
+
+
+def score_sweep(pairs: Sequence[tuple[Scene, SceneBoxes]]) -> NuScenesTrackingMetrics:
+    """Score the tracks of scenes with ground truth by the metrics of the task: all classes, at any distance.
+
+    Hidden objects are left out. A frame counts as one median step of time in TID and LGD.
+    """
+    scenes = []
+    for scene, found in pairs:
+        truth = SceneBoxes.of_annotations(scene.ground_truth or (), hidden=False)
+        scenes.append(NuScenesTrackingScene(scene.timestamps, np.zeros((len(scene), 2)), truth, found))
+    labels = sorted({label for each in scenes for t in (each.truth, each.found) for label in t.boxes.label.tolist()})
+    steps = np.concatenate([np.empty(0), *(np.diff(each.timestamps) for each in scenes)])
+    period = float(np.median(steps)) if len(steps) else 1.0
+    settings = NuScenesTrackingSettings(class_range=dict.fromkeys(labels, np.inf), sample_period=period)
+    return nuscenes_tracking_metrics(scenes, settings)
+
+
+def best_thresholds(metrics: NuScenesTrackingMetrics) -> dict[str, float]:
+    """The score threshold of best MOTA of each class that occurs; infinite for one that is never matched."""
+    best = {}
+    for label, curves in metrics.curves.items():
+        reached = np.where(np.isfinite(curves.score), curves.mota, -np.inf)
+        best[label] = float(curves.score[np.argmax(reached)]) if np.isfinite(curves.score).any() else np.inf
+    return best

@@ -42,9 +42,8 @@ import numpy as np
 
 from data_tools.datasets.detection_files import PredictionRows
 from data_tools.datasets.source import AreaMap, Images
-from data_tools.evaluation import best_thresholds, score_sweep
 from data_tools.files import isolated
-from data_tools.metrics import SceneBoxes, match_scene
+from data_tools.metrics import SceneBoxes, best_thresholds, match_scene, score_sweep
 from pipelines.report.figures import unseen_for
 from pipelines.tracking import TrackedScene
 from saga_fg import Boxes, ConstantVelocity, Frame, NodeType, Scene, Sensor

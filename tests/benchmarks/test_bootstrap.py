@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.bootstrap import difference, paired_bootstrap, ratio_of_sums
+from benchmarks.bootstrap import difference, paired_bootstrap, ratio_of_sums, square_sums
 from data_tools.metrics import ErrorSample
 from saga_fg.errors import InputError
 
@@ -12,7 +12,7 @@ def test_totals_are_pooled_and_a_constant_factor_is_found_exactly():
     rng = np.random.default_rng(1)
     b = [ErrorSample(rng.rayleigh(1.0, size=50)) for _ in range(8)]
     a = [ErrorSample(0.7 * sample.values) for sample in b]
-    interval = paired_bootstrap([s.square_sums for s in a], [s.square_sums for s in b])
+    interval = paired_bootstrap([*map(square_sums, a)], [*map(square_sums, b)])
     assert interval.estimate == pytest.approx(-0.3)
     assert (interval.low, interval.high) == pytest.approx((-0.3, -0.3))
     interval = paired_bootstrap([[90.0, 100.0], [0.0, 1.0]], [[50.0, 100.0], [1.0, 1.0]], ratio_of_sums, difference)

@@ -15,9 +15,8 @@ from data_tools.datasets.kitti.source import KittiSource
 from data_tools.datasets.nuscenes import NuScenes
 from data_tools.datasets.nuscenes.source import NuScenesSource
 from data_tools.datasets.source import clipped
-from data_tools.evaluation import best_thresholds, score_sweep
 from data_tools.figures import Chart, Series, class_colours
-from data_tools.metrics import SceneBoxes, scene_metrics
+from data_tools.metrics import SceneBoxes, best_thresholds, scene_metrics, score_sweep
 from pipelines.report import Report, ReportScene, report_page
 from pipelines.report.scenes import (
     ADDED,

@@ -11,8 +11,15 @@ import pytest
 from data_tools.datasets.detection_files import read_tracks
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.datasets.nuscenes import NuScenes, write_nuscenes
-from data_tools.evaluation import placed_detections
-from data_tools.metrics import ErrorSample, LabelErrors, SceneBoxes, error_summary, label_errors, match_scene
+from data_tools.metrics import (
+    ErrorSample,
+    LabelErrors,
+    SceneBoxes,
+    error_summary,
+    label_errors,
+    match_scene,
+    placed_detections,
+)
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.config import Family
 from pipelines.configuration import read_settings, write_settings

@@ -39,9 +39,8 @@ from data_tools.datasets.argoverse2.logs import (
     transforms,
 )
 from data_tools.datasets.detection_files import TrackRows, read_detections
-from data_tools.datasets.given_tracks import AnnotatedSource
 from data_tools.datasets.results import Results, scene_result
-from data_tools.datasets.source import ChosenScenes, ResultFormat, Surroundings, TrackedScenes, option
+from data_tools.datasets.source import ChosenScenes, DatasetSource, ResultFormat, Surroundings, TrackedScenes, option
 from data_tools.files import arrow_arrays, atomic_file, is_url, local_copy, local_tree
 from saga_fg.errors import InputError, error_context
 from saga_fg.numerics import (
@@ -232,7 +231,7 @@ class ArgoverseFormat(ResultFormat):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ArgoverseSource(AnnotatedSource):
+class ArgoverseSource(DatasetSource):
     """Argoverse 2 sensor logs, with detections as Feather in the official format; needs the extra [parquet]."""
 
     name = "argoverse2"
@@ -247,15 +246,12 @@ class ArgoverseSource(AnnotatedSource):
         None,
         metavar="FILE",
     )
-
-    @contextmanager
-    def annotated(self) -> Iterator[ArgoverseLogs]:
-        with local_tree(self.dataroot, [f"*/{name}" for name in FILES]) as root:
-            yield ArgoverseLogs(root)
+    scenes: str | None = option("Recordings with commas between them; all if left out.", None)
 
     @contextmanager
     def open(self, truth: bool = False) -> Iterator[Dataset]:
-        with self.annotated() as logs:
+        with local_tree(self.dataroot, [f"*/{name}" for name in FILES]) as root:
+            logs = ArgoverseLogs(root)
             if self.detections is None:
                 yield self._chosen(AnnotatedLogs(logs, None))
                 return

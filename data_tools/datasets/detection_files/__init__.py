@@ -56,17 +56,15 @@ position, m^2), cov_vxvx, cov_vxvy, cov_vyvy (of the velocity, (m/s)^2), coastin
 and settled (0 where the solver found no minimum of a nonlinear graph, else 1).
 """
 
-from data_tools.datasets.detection_files.dataset import read_detections, read_scenes_in_parts
+from data_tools.datasets.detection_files.dataset import TruthTable, read_detections, read_scenes_in_parts, read_truth
 from data_tools.datasets.detection_files.tracks import (
     PREDICTION_COLUMNS,
     PredictionRows,
     TrackRows,
-    TruthTable,
     prediction_writer,
     predictions_path,
     read_predictions,
     read_tracks,
-    read_truth,
     track_rows,
     write_label_table,
     write_review,

@@ -1,17 +1,26 @@
-"""A table of detections as a dataset: rows with the same scene, time and sensor become frames.
+"""Tables of detections and of true objects as datasets: rows with the same scene, time and sensor become frames.
 
 A first look at a table: how its columns, times and classes are understood, and what is doubtful.
+
+Tables of true objects: a row per object and moment, with the columns of tracks and `visible`, 0 where hidden.
+
+The moments of a scene are the times of its rows. Velocities that are not there are central differences of positions
+over about half a second; positions in coordinates of the vehicle are moved to the world by its pose.
 """
 
-from collections.abc import Collection, Iterator, Mapping
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from data_tools.datasets.detection_files.formats import ROWS, Layout, read_raw_parts, read_raw_table
-from saga_fg.errors import InputError, unknown_name
-from saga_fg.numerics import BoolArray, FloatArray
+from data_tools.datasets.detection_files.tracks import TRACK_REQUIRED, TrackRows, log_findings, track_rows
+from data_tools.trajectories import central_differences
+from saga_fg.errors import InputError, error_context, unknown_name
+from saga_fg.numerics import BoolArray, FloatArray, yaw_transform
 from saga_fg.tables import (
     BOX,
     COLUMNS,
@@ -27,7 +36,7 @@ from saga_fg.tables import (
     seems_dense_traffic,
     sorted_by_time,
 )
-from saga_fg.types import Finding, Scene
+from saga_fg.types import Annotations, Boxes, Finding, Scene
 
 
 def read_detections(path: str | Path, how: TableImport | None = None) -> DetectionTable:
@@ -219,3 +228,113 @@ def _times(raw: RawTable) -> tuple[SensorTimes, ...]:
                 )
             )
     return tuple(found)
+
+
+TRUTH_COLUMNS = (*TRACK_COLUMNS, SETTLED, *QUATERNION, "coordinates", *POSE, *ROTATIONS["ego_yaw"], "visible")
+REACH = 0.25  # s to either side, for a velocity
+LONGEST_GAP = 2.5  # steps between rows of an object, for a velocity
+
+
+class TruthTable:
+    """The scenes of one table of true objects, with ground truth alone.
+
+    path  it is from, for errors
+    rows  in coordinates of the vehicle where `in_ego` (N,) is set
+    visible, pose, in_ego  of the rows: masks (N,), and x, y, z, yaw (N, 4) of the vehicle, NaN where unknown
+
+    Raises `InputError` without rows.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        rows: TrackRows,
+        visible: BoolArray | None = None,
+        pose: FloatArray | None = None,
+        in_ego: BoolArray | None = None,
+    ) -> None:
+        n = len(rows.id)
+        if not n:
+            raise InputError(f"{path}: expected at least one row, the table is empty")
+        self.path, self.rows, self.named = path, rows, rows.named
+        self._visible = np.ones(n, dtype=np.bool_) if visible is None else visible
+        self._pose = np.full((n, 4), np.nan) if pose is None else pose
+        self._in_ego = np.zeros(n, dtype=np.bool_) if in_ego is None else in_ego
+        self.posed = bool(np.isfinite(self._pose).all())
+        _, first = np.unique(rows.scene, return_index=True)
+        self.scenes: tuple[str, ...] = tuple(rows.scene[np.sort(first)].tolist())
+
+    @classmethod
+    def from_table(
+        cls, raw: RawTable, tell: Callable[[Sequence[Finding], RawTable], None] = log_findings
+    ) -> TruthTable:
+        """Check everything; tell as of `track_rows`. Raises `InputError` naming file, row and column."""
+        rows, kept, pose = track_rows(raw, tell), np.flatnonzero(~raw.labels()[1]), _poses(raw)
+        in_ego = raw.texts("coordinates", raw.how.coordinates or "world") == "ego"
+        in_ego &= np.isfinite(pose).all(axis=1)
+        return cls(raw.path, rows, _visible(raw)[kept], pose[kept], in_ego[kept])
+
+    def scene(self, name: str) -> Scene:
+        """One of the scenes; raises `InputError` for an unknown name and an object that is there twice at a time."""
+        if name not in self.scenes:
+            raise InputError(f"{self.path}: {unknown_name('scene', name, self.scenes)}")
+        rows = np.flatnonzero(self.rows.scene == name)
+        times, moment = np.unique(self.rows.timestamp[rows], return_inverse=True)
+        poses = _scene_poses(self.rows, rows, moment, self._pose)
+        boxes = _in_world(self.rows.boxes.select(rows), self._in_ego[rows], poses[moment])
+        if np.isnan(boxes.velocity).all() and len(times) > 1:
+            step = float(np.median(np.diff(times)))
+            reach = max(1, round(REACH / step))
+            ids = self.rows.id[rows]
+            velocity = central_differences(ids, times[moment], boxes.position[:, :2], LONGEST_GAP * step, reach)
+            boxes = replace(boxes, velocity=velocity)
+        truth = []
+        for k, at in enumerate(np.split(np.argsort(moment, kind="stable"), np.cumsum(np.bincount(moment))[:-1])):
+            with error_context(f"{self.path}: scene {name}: {times[k]} s"):
+                truth.append(Annotations(self.rows.id[rows][at], boxes.select(at), self._visible[rows][at]))
+        return Scene(name, times, poses, ("",) * len(times), (), truth)
+
+
+def read_truth(path: str | Path, how: TableImport | None = None) -> TruthTable:
+    """Read a table of true objects. Raises `InputError` naming file, row and column."""
+    return TruthTable.from_table(read_raw_table(Path(path), Layout(TRUTH_COLUMNS, TRACK_REQUIRED, lenient=True), how))
+
+
+def _scene_poses(rows: TrackRows, at: Sequence[int] | np.ndarray, moment: np.ndarray, pose: FloatArray) -> FloatArray:
+    """world_T_ego (K, 4, 4): those of the table, else an upright vehicle amid all objects."""
+    _, first = np.unique(moment, return_index=True)
+    if np.isfinite(pose[at]).all():
+        return np.array([yaw_transform(*each) for each in pose[at][first].tolist()])
+    poses = np.tile(np.eye(4), (len(first), 1, 1))
+    poses[:, :2, 3] = np.median(rows.boxes.position[at, :2], axis=0)
+    return poses
+
+
+def _in_world(boxes: Boxes, in_ego: BoolArray, world_T_ego: FloatArray) -> Boxes:
+    """Boxes (N) with those in coordinates of the vehicle moved to the world; poses (N, 4, 4) of their moments."""
+    if not in_ego.any():
+        return boxes
+    R, t = world_T_ego[:, :3, :3], world_T_ego[:, :3, 3]
+    turn = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    position = np.einsum("nij,nj->ni", R, boxes.position) + t
+    velocity = np.einsum("nij,nj->ni", R[:, :2, :2], boxes.velocity)
+    return replace(
+        boxes,
+        position=np.where(in_ego[:, None], position, boxes.position),
+        velocity=np.where(in_ego[:, None], velocity, boxes.velocity),
+        yaw=np.where(in_ego, boxes.yaw + turn, boxes.yaw),
+    )
+
+
+def _poses(raw: RawTable) -> FloatArray:
+    """x, y, z, yaw (N, 4) of the vehicle, NaN where the table has none."""
+    return np.stack([raw.numbers(name, 0.0 if name == "ego_z" else np.nan) for name in POSE], axis=-1)
+
+
+def _visible(raw: RawTable) -> BoolArray:
+    """Mask (N,) of the objects that can be seen: all that no column `visible` calls 0 or false."""
+    values = raw.columns.get("visible", ())
+    if not len(values):
+        return np.ones(raw.length, dtype=np.bool_)
+    listed = values.tolist() if isinstance(values, np.ndarray) else values
+    return np.array([str(value).strip().lower() not in ("0", "0.0", "false") for value in listed], dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""Tables of tracks, labels, predicted tracks and true objects, written and read back: a row per box.
+"""Tables of tracks, labels and predicted tracks, written and read back: a row per box.
 
 Tables of labels have the columns of tracks and
 
@@ -6,11 +6,6 @@ Tables of labels have the columns of tracks and
     source         observed, filled or extended
     quality        high, medium or low
     p_exists, p_class, p_identity, p_heading  probabilities that the label is right
-
-Tables of true objects: a row per object and moment, with the columns of tracks and `visible`, 0 where hidden.
-
-The moments of a scene are the times of its rows. Velocities that are not there are central differences of positions
-over about half a second; positions in coordinates of the vehicle are moved to the world by its pose.
 
 Predicted tracks as a table beside the tracks: a row per track, moment and horizon, CSV.
 
@@ -30,7 +25,7 @@ import logging
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -39,24 +34,19 @@ import numpy as np
 
 from data_tools.datasets.detection_files.formats import Layout, read_raw_table
 from data_tools.files import atomic_file, open_bytes
-from data_tools.trajectories import central_differences
-from saga_fg.errors import InputError, MissingExtraError, error_context, unknown_name
+from saga_fg.errors import InputError, MissingExtraError, error_context
 from saga_fg.numerics import (
-    BoolArray,
     Columns,
     FloatArray,
     StrArray,
     from_upper_triangle,
     upper_triangle,
-    yaw_transform,
 )
 from saga_fg.tables import (
     LABEL_COLUMNS,
-    POSE,
     PROBABILITIES,
     QUATERNION,
     REVIEW_COLUMNS,
-    ROTATIONS,
     SETTLED,
     TRACK_COLUMNS,
     RawTable,
@@ -65,7 +55,7 @@ from saga_fg.tables import (
     box_columns,
     findings_of,
 )
-from saga_fg.types import Annotations, Boxes, Finding, PredictedTracks, Scene, Tracks, refuse_contradictions
+from saga_fg.types import Boxes, Finding, PredictedTracks, Scene, Tracks, refuse_contradictions
 
 if TYPE_CHECKING:
     from saga_fg.smoothing import Labels, Review
@@ -187,7 +177,7 @@ def merge_tables(path: Path, parts: Iterable[Path]) -> None:
                 shutil.copyfileobj(table, file)
 
 
-REQUIRED = ("timestamp", "id", "x", "y")
+TRACK_REQUIRED = ("timestamp", "id", "x", "y")
 OWN = frozenset({"timestamp", "id", "x", "y", "cov_xx", "coasting"})  # columns of a table that saga-fg wrote
 NUMBERS = tuple(name for name in TRACK_COLUMNS if name not in ("scene", "id", "label"))
 
@@ -258,11 +248,11 @@ def read_tracks(
     labels   whether the columns of labels have a meaning
     """
     columns = LABEL_COLUMNS if labels else TRACK_COLUMNS
-    layout = Layout((*columns, SETTLED, *QUATERNION), REQUIRED, lenient)
+    layout = Layout((*columns, SETTLED, *QUATERNION), TRACK_REQUIRED, lenient)
     return track_rows(read_raw_table(Path(path), layout, how, own=OWN))
 
 
-def _log_findings(findings: Sequence[Finding], raw: RawTable) -> None:
+def log_findings(findings: Sequence[Finding], raw: RawTable) -> None:
     """Log what is doubtful in a file; raises `InputError` for what contradicts how it is read."""
     with error_context(str(raw.path)):
         refuse_contradictions(findings)
@@ -270,7 +260,7 @@ def _log_findings(findings: Sequence[Finding], raw: RawTable) -> None:
         log.warning("%s: %s", raw.path, finding)
 
 
-def track_rows(raw: RawTable, tell: Callable[[Sequence[Finding], RawTable], None] = _log_findings) -> TrackRows:
+def track_rows(raw: RawTable, tell: Callable[[Sequence[Finding], RawTable], None] = log_findings) -> TrackRows:
     """The tracks in a table that may have further columns; without those of classes that are to be left out.
 
     tell  says what is doubtful in it, and raises `InputError` for contradictions
@@ -310,116 +300,6 @@ def track_rows(raw: RawTable, tell: Callable[[Sequence[Finding], RawTable], None
 
 def _covariance(raw: RawTable, names: tuple[str, str, str]) -> FloatArray:
     return from_upper_triangle(np.stack([raw.numbers(name) for name in names], axis=-1))
-
-
-TRUTH_COLUMNS = (*TRACK_COLUMNS, SETTLED, *QUATERNION, "coordinates", *POSE, *ROTATIONS["ego_yaw"], "visible")
-REACH = 0.25  # s to either side, for a velocity
-LONGEST_GAP = 2.5  # steps between rows of an object, for a velocity
-
-
-class TruthTable:
-    """The scenes of one table of true objects, with ground truth alone.
-
-    path  it is from, for errors
-    rows  in coordinates of the vehicle where `in_ego` (N,) is set
-    visible, pose, in_ego  of the rows: masks (N,), and x, y, z, yaw (N, 4) of the vehicle, NaN where unknown
-
-    Raises `InputError` without rows.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        rows: TrackRows,
-        visible: BoolArray | None = None,
-        pose: FloatArray | None = None,
-        in_ego: BoolArray | None = None,
-    ) -> None:
-        n = len(rows.id)
-        if not n:
-            raise InputError(f"{path}: expected at least one row, the table is empty")
-        self.path, self.rows, self.named = path, rows, rows.named
-        self._visible = np.ones(n, dtype=np.bool_) if visible is None else visible
-        self._pose = np.full((n, 4), np.nan) if pose is None else pose
-        self._in_ego = np.zeros(n, dtype=np.bool_) if in_ego is None else in_ego
-        self.posed = bool(np.isfinite(self._pose).all())
-        _, first = np.unique(rows.scene, return_index=True)
-        self.scenes: tuple[str, ...] = tuple(rows.scene[np.sort(first)].tolist())
-
-    @classmethod
-    def from_table(
-        cls, raw: RawTable, tell: Callable[[Sequence[Finding], RawTable], None] = _log_findings
-    ) -> TruthTable:
-        """Check everything; tell as of `track_rows`. Raises `InputError` naming file, row and column."""
-        rows, kept, pose = track_rows(raw, tell), np.flatnonzero(~raw.labels()[1]), _poses(raw)
-        in_ego = raw.texts("coordinates", raw.how.coordinates or "world") == "ego"
-        in_ego &= np.isfinite(pose).all(axis=1)
-        return cls(raw.path, rows, _visible(raw)[kept], pose[kept], in_ego[kept])
-
-    def scene(self, name: str) -> Scene:
-        """One of the scenes; raises `InputError` for an unknown name and an object that is there twice at a time."""
-        if name not in self.scenes:
-            raise InputError(f"{self.path}: {unknown_name('scene', name, self.scenes)}")
-        rows = np.flatnonzero(self.rows.scene == name)
-        times, moment = np.unique(self.rows.timestamp[rows], return_inverse=True)
-        poses = _scene_poses(self.rows, rows, moment, self._pose)
-        boxes = _in_world(self.rows.boxes.select(rows), self._in_ego[rows], poses[moment])
-        if np.isnan(boxes.velocity).all() and len(times) > 1:
-            step = float(np.median(np.diff(times)))
-            reach = max(1, round(REACH / step))
-            ids = self.rows.id[rows]
-            velocity = central_differences(ids, times[moment], boxes.position[:, :2], LONGEST_GAP * step, reach)
-            boxes = replace(boxes, velocity=velocity)
-        truth = []
-        for k, at in enumerate(np.split(np.argsort(moment, kind="stable"), np.cumsum(np.bincount(moment))[:-1])):
-            with error_context(f"{self.path}: scene {name}: {times[k]} s"):
-                truth.append(Annotations(self.rows.id[rows][at], boxes.select(at), self._visible[rows][at]))
-        return Scene(name, times, poses, ("",) * len(times), (), truth)
-
-
-def read_truth(path: str | Path, how: TableImport | None = None) -> TruthTable:
-    """Read a table of true objects. Raises `InputError` naming file, row and column."""
-    return TruthTable.from_table(read_raw_table(Path(path), Layout(TRUTH_COLUMNS, REQUIRED, lenient=True), how))
-
-
-def _scene_poses(rows: TrackRows, at: Sequence[int] | np.ndarray, moment: np.ndarray, pose: FloatArray) -> FloatArray:
-    """world_T_ego (K, 4, 4): those of the table, else an upright vehicle amid all objects."""
-    _, first = np.unique(moment, return_index=True)
-    if np.isfinite(pose[at]).all():
-        return np.array([yaw_transform(*each) for each in pose[at][first].tolist()])
-    poses = np.tile(np.eye(4), (len(first), 1, 1))
-    poses[:, :2, 3] = np.median(rows.boxes.position[at, :2], axis=0)
-    return poses
-
-
-def _in_world(boxes: Boxes, in_ego: BoolArray, world_T_ego: FloatArray) -> Boxes:
-    """Boxes (N) with those in coordinates of the vehicle moved to the world; poses (N, 4, 4) of their moments."""
-    if not in_ego.any():
-        return boxes
-    R, t = world_T_ego[:, :3, :3], world_T_ego[:, :3, 3]
-    turn = np.arctan2(R[:, 1, 0], R[:, 0, 0])
-    position = np.einsum("nij,nj->ni", R, boxes.position) + t
-    velocity = np.einsum("nij,nj->ni", R[:, :2, :2], boxes.velocity)
-    return replace(
-        boxes,
-        position=np.where(in_ego[:, None], position, boxes.position),
-        velocity=np.where(in_ego[:, None], velocity, boxes.velocity),
-        yaw=np.where(in_ego, boxes.yaw + turn, boxes.yaw),
-    )
-
-
-def _poses(raw: RawTable) -> FloatArray:
-    """x, y, z, yaw (N, 4) of the vehicle, NaN where the table has none."""
-    return np.stack([raw.numbers(name, 0.0 if name == "ego_z" else np.nan) for name in POSE], axis=-1)
-
-
-def _visible(raw: RawTable) -> BoolArray:
-    """Mask (N,) of the objects that can be seen: all that no column `visible` calls 0 or false."""
-    values = raw.columns.get("visible", ())
-    if not len(values):
-        return np.ones(raw.length, dtype=np.bool_)
-    listed = values.tolist() if isinstance(values, np.ndarray) else values
-    return np.array([str(value).strip().lower() not in ("0", "0.0", "false") for value in listed], dtype=np.bool_)
 
 
 _NAMES = ("scene", "timestamp", "horizon", "id", "label")

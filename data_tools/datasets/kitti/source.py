@@ -61,7 +61,7 @@ from data_tools.datasets.source import (
     option,
     tracks_of,
 )
-from data_tools.evaluation import Evaluation, HotaRow, mean_scores, placed_detections
+from data_tools.evaluation import Evaluation, HotaRow, mean_scores
 from data_tools.figures import FigureTable, cell
 from data_tools.files import atomic_directory, is_url
 from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box, world_boxes_to_camera
@@ -75,6 +75,7 @@ from data_tools.metrics import (
     kitti_tracking_metrics,
     label_errors,
     label_velocities,
+    placed_detections,
 )
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import FloatArray, IntArray, inverse_transform

@@ -32,25 +32,20 @@ from data_tools.datasets.source import (
     option,
     tracks_of,
 )
-from data_tools.evaluation import (
-    Evaluation,
-    HotaRow,
-    PlacedBoxes,
-    best_thresholds,
-    hota,
-    placed_detections,
-    sweep_table,
-)
+from data_tools.evaluation import Evaluation, HotaRow, hota, sweep_table
 from data_tools.files import is_url, local_copy, local_tree
 from data_tools.metrics import (
     LabelErrors,
     NuScenesTrackingMetrics,
     NuScenesTrackingScene,
     NuScenesTrackingSettings,
+    PlacedBoxes,
     SceneBoxes,
+    best_thresholds,
     label_errors,
     label_velocities,
     nuscenes_tracking_metrics,
+    placed_detections,
 )
 from saga_fg.errors import InputError
 from saga_fg.numerics import FloatArray
