@@ -33,7 +33,6 @@ from data_tools.datasets.nuscenes.tables import (
     read_scenes,
     read_table,
     rigid_transform,
-    split_scenes,
     table_folder,
 )
 from data_tools.datasets.source import AreaMap, Images, Kind, map_points
@@ -98,10 +97,6 @@ class NuScenes:
     def meta(self) -> ResultMeta:
         """Sensors and data that the detection files use, together."""
         return ResultMeta.union(*(result.meta for result in self._results.values()))
-
-    def split(self, name: str) -> tuple[str, ...]:
-        """The scenes of a split that the tables hold (see `split_scenes`)."""
-        return split_scenes(self.dataroot, self.version, name)
 
     def scene(self, name: str) -> Scene:
         """One of the chosen scenes; raises `InputError` for another name."""

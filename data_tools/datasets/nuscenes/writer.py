@@ -91,13 +91,14 @@ class Channel(NamedTuple):
 LIDAR = Channel("LIDAR_TOP", "lidar")
 
 
-def write_nuscenes(directory: str | Path, dataset: Dataset, mounts: Mounts, version: str = "v1.0-mini") -> None:
+VERSION = "v1.0-mini"
+
+
+def write_nuscenes(directory: str | Path, dataset: Dataset, mounts: Mounts) -> None:
     """Write all scenes of `dataset`, with the sensors of `mounts`; all files appear when the last scene is done.
 
-    Raises `InputError` for a directory that is not writable, and for a version that is not a plain name.
+    Raises `InputError` for a directory that is not writable.
     """
-    if not version or Path(version).name != version:
-        raise InputError(f"version: expected a plain name such as v1.0-mini, got {version!r}")
     with atomic_directory(directory) as folder:
         tables: Tables = defaultdict(list)
         classes = dict.fromkeys(CLASSES)
@@ -110,11 +111,11 @@ def write_nuscenes(directory: str | Path, dataset: Dataset, mounts: Mounts, vers
             for sensor, samples in results.items():
                 samples.update(_detections(scene, sensor))
         tables |= _shared_tables(mounts, dataset.scenes, tuple(classes))
-        for part in (version, "detections", "maps"):
+        for part in (VERSION, "detections", "maps"):
             (folder / part).mkdir()
         for table, records in tables.items():
-            _write_json(folder / version / f"{table}.json", records)
-        _write_json(folder / version / "splits.json", {"all": list(dataset.scenes)})
+            _write_json(folder / VERSION / f"{table}.json", records)
+        _write_json(folder / VERSION / "splits.json", {"all": list(dataset.scenes)})
         for sensor, samples in results.items():
             meta = asdict(ResultMeta(**{f"use_{_channel_of(sensor).modality}": True}))
             _write_json(folder / "detections" / f"{sensor}.json", {"meta": meta, "results": samples})
