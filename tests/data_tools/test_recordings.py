@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from data_tools.datasets.kitti import kitti_scans
-from data_tools.kitti_objects import CameraBoxes, camera_boxes_to_world, world_boxes_to_camera
+from data_tools.metrics.kitti_boxes import CameraBoxes, camera_boxes_to_world, world_boxes_to_camera
 from data_tools.sensor_logs import SensorLog, kitti_sensor_log, read_sensor_log
 from saga_fg import InputError
 from saga_fg.numerics.geometry import yaw_transform

@@ -55,8 +55,8 @@ from data_tools.datasets.kitti.labels import (
 )
 from data_tools.datasets.source import Images
 from data_tools.files import TextTable, local_tree, read_lines, read_table
-from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box
 from data_tools.lidar import KITTI, Scan, ScanRecording, azimuth_times, read_records
+from data_tools.metrics.kitti_boxes import KittiObjects, camera_boxes_to_world, has_box
 from data_tools.trajectories import central_differences
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import FloatArray, inverse_transform, is_rotation

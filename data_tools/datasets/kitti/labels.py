@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 
 from data_tools.files import TextTable, read_table
-from data_tools.kitti_objects import CameraBoxes, KittiObjects, has_box
+from data_tools.metrics.kitti_boxes import CameraBoxes, KittiObjects, has_box
 from saga_fg.errors import InputError, unknown_name
 from saga_fg.numerics import FloatArray, IntArray, StrArray, wrap_angle
 

@@ -64,7 +64,6 @@ from data_tools.datasets.source import (
 from data_tools.evaluation import Evaluation, HotaRow, mean_scores
 from data_tools.figures import FigureTable, cell
 from data_tools.files import atomic_directory, is_url
-from data_tools.kitti_objects import KittiObjects, camera_boxes_to_world, has_box, world_boxes_to_camera
 from data_tools.metrics import (
     KittiSimilarity,
     KittiTrackingMetrics,
@@ -77,6 +76,7 @@ from data_tools.metrics import (
     label_velocities,
     placed_detections,
 )
+from data_tools.metrics.kitti_boxes import KittiObjects, camera_boxes_to_world, has_box, world_boxes_to_camera
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import FloatArray, IntArray, inverse_transform
 from saga_fg.types import Scene, Tracks, known_velocities

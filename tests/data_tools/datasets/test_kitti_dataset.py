@@ -17,7 +17,7 @@ from data_tools.datasets.kitti import (
     write_kitti_results,
 )
 from data_tools.datasets.kitti.source import read_scored_sequences
-from data_tools.kitti_objects import CameraBoxes, has_box
+from data_tools.metrics.kitti_boxes import CameraBoxes, has_box
 from saga_fg import Dataset, InputError, Tracks
 from saga_fg.numerics.geometry import inverse_transform, transform_points
 from tests.data_tools.kitti_example import CALIBRATION, LABELS, calibration_text, oxts_line, write_sequence

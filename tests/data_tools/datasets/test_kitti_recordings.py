@@ -14,7 +14,7 @@ from data_tools.datasets.kitti import (
     write_kitti_results,
 )
 from data_tools.datasets.kitti.source import TRACK_TABLE
-from data_tools.kitti_objects import has_box
+from data_tools.metrics.kitti_boxes import has_box
 from saga_fg import Boxes, InputError, Scene, Tracks
 from tests.data_tools.kitti_example import write_sequence
 

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from data_tools.datasets.kitti.labels import read_kitti_labels
-from data_tools.kitti_objects import CameraBoxes, KittiObjects
 from data_tools.metrics import KittiTrackingSequence, SceneBoxes, hota_metrics, kitti_tracking_metrics
+from data_tools.metrics.kitti_boxes import CameraBoxes, KittiObjects
 from data_tools.metrics.kitti_tracking import track_scores, trajectory_counts
 from saga_fg import Boxes, InputError, MissingExtraError
 
