@@ -352,14 +352,16 @@ class DatasetSource(ABC):
 
     @contextmanager
     def parts(self) -> Iterator[Parts]:
-        """The recordings one by one, for workers: by default scenes that are read here and sent; scenes of a dataset
-        that says the `files` of each are read there."""
+        """The recordings one by one, for workers.
+
+        By default scenes are read here and sent; those of a dataset that has a method `files` are read by the worker.
+        """
         with self.open() as dataset:
-            names = dataset.scenes
-            if hasattr(dataset, "files"):
-                yield Parts(names, (SourcePart(self.restricted([name]), name) for name in names))
+            scenes = dataset.scenes
+            if callable(getattr(dataset, "files", None)):
+                yield Parts(scenes, (SourcePart(self.restricted([name]), name) for name in scenes))
             else:
-                yield Parts(names, (HeldScene(dataset.scene(name)) for name in names), dataset)
+                yield Parts(scenes, (HeldScene(dataset.scene(name)) for name in scenes), dataset)
 
     def stream(self) -> AbstractContextManager[Iterator[Scene]] | None:
         """Recordings as successive parts of scenes, to smooth them while they are read; None to hold each in memory."""
