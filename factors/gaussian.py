@@ -286,8 +286,7 @@ def _freedom(information: FloatArray) -> FloatArray:
     scale[scale == 0] = 1.0
     eigenvalues, vectors = np.linalg.eigh(information / scale[:, None] / scale)
     null: FloatArray = vectors[:, eigenvalues < _ZERO * max(1.0, len(scale) ** 0.5)]
-    share: FloatArray = (null**2).sum(axis=1)
-    return share
+    return np.asarray((null**2).sum(axis=1))
 
 
 def _owners(

@@ -100,8 +100,7 @@ def whitener(name: str, covariance: ArrayLike, dim: int) -> FloatArray:
     that nobody sees, Q = 2e-5 m^2: 2e-14 of P in place of 2e-9).
     Raises `FactorError` when the covariance is not symmetric and positive definite (or is so only up to rounding).
     """
-    only: FloatArray = whiteners(name, checked(name, covariance, (dim, dim))[None])[0]
-    return only
+    return np.asarray(whiteners(name, checked(name, covariance, (dim, dim))[None])[0])
 
 
 def whiteners(name: str, covariances: ArrayLike, dim: int | None = None) -> FloatArray:

@@ -18,9 +18,7 @@ ABOVE = {"evaluate": "data_tools.datasets.data_frames:evaluate", "view": "pipeli
 def __getattr__(name):
     if not name.startswith("__"):
         _check_factors()
-    if name in ABOVE:
-        return resolve_name(ABOVE[name])
-    return _attribute(name)
+    return resolve_name(ABOVE[name]) if name in ABOVE else _attribute(name)
 
 
 @cache

@@ -1,7 +1,7 @@
 """Estimators behind one base class, and the textbook reference they must agree with."""
 
 from saga_fg.estimators.batch import BatchSolver, GraphSolution
-from saga_fg.estimators.estimator import Estimator, missing
+from saga_fg.estimators.estimator import Estimator
 from saga_fg.estimators.graph_filter import GraphFilter
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.isam2_engine import RelinearisationSettings
@@ -31,6 +31,5 @@ __all__ = [
     "SmoothedState",
     "kalman_predict",
     "kalman_update",
-    "missing",
     "rts_smooth",
 ]

@@ -18,6 +18,7 @@ What is read of it comes from `posterior`; copies and snapshots copy all attribu
 methods may change arrays in place.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass
@@ -36,11 +37,6 @@ from saga_fg.model import Transition
 from saga_fg.numerics import BoolArray, FloatArray, IntArray
 from saga_fg.types import Frame
 
-ESSENTIAL = ("time", "add", "predict", "update", "marginalise", "posterior")
-"""Methods that every estimator has."""
-POSES = ("extend", "covariance_with")
-"""Methods of an estimator that has the vehicle's pose as a variable beside the nodes."""
-
 
 @dataclass(frozen=True, eq=False)
 class EstimatorState:
@@ -50,7 +46,7 @@ class EstimatorState:
     attributes: Mapping[str, Any]
 
 
-class Estimator:
+class Estimator(ABC):
     """The joint state of all nodes. Every method raises `InputError` or `UnknownNodeError` and then changes nothing.
 
     `copy.copy` returns an estimator that changes independently of this one. Beside the nodes there may be others, such
@@ -67,20 +63,20 @@ class Estimator:
     # the Gaussian, moved and corrected
 
     @property
+    @abstractmethod
     def time(self) -> float:
         """Sum of all intervals since the start, s."""
-        raise NotImplementedError
 
     @property
     def nodes(self) -> IntArray:
         """(n,) ids in the order of the joint state."""
         return self.posterior().layout.nodes
 
+    @abstractmethod
     def add(
         self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike, labels: Mapping[int, str] | None = None
     ) -> None:
         """Add nodes independent of all others: ids (k,), means (k, d), covariances (k, d, d); classes by id."""
-        raise NotImplementedError
 
     def add_unchecked(
         self, nodes: IntArray, means: FloatArray, covariances: FloatArray, labels: Mapping[int, str] | None = None
@@ -88,10 +84,11 @@ class Estimator:
         """Add nodes as `add` does, whose numbers were checked where they came in."""
         self.add(nodes, means, covariances, labels)
 
+    @abstractmethod
     def predict(self, transition: Transition) -> None:
         """Move all nodes by a transition over exactly the present nodes, in any order."""
-        raise NotImplementedError
 
+    @abstractmethod
     def update(
         self,
         measurements: Measurements | Observations | Sequence[Measurements | Observations],
@@ -102,11 +99,10 @@ class Estimator:
         time: when they were made, s, on this clock, which `remembered` is true of; None: now. NaN is returned where
         nothing is computed before it is asked for.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def marginalise(self, nodes: ArrayLike) -> None:
         """Integrate out nodes that disappear, so that their information on their neighbours stays."""
-        raise NotImplementedError
 
     def remembered(self, nodes: ArrayLike, time: float) -> BoolArray:
         """(k,) whether measurements of nodes at `time`, s, can still be put there; asked where `lag` is above 0."""
@@ -114,9 +110,9 @@ class Estimator:
 
     # what is read
 
+    @abstractmethod
     def posterior(self) -> BlockGaussian:
         """The joint Gaussian: of the nodes, and perhaps of others."""
-        raise NotImplementedError
 
     @property
     def unsettled(self) -> IntArray:
@@ -134,8 +130,7 @@ class Estimator:
     def joint_mean(self, nodes: ArrayLike) -> FloatArray:
         """Stacked mean of some nodes, in the order given, of any sizes."""
         x = self.posterior()
-        mean: FloatArray = x.mean[x.layout.places(x.layout.rows(nodes))]
-        return mean
+        return np.asarray(x.mean[x.layout.places(x.layout.rows(nodes))])
 
     def joint_covariance(self, nodes: ArrayLike) -> FloatArray:
         """Joint covariance of some nodes, in the order given, of any sizes."""
@@ -180,10 +175,10 @@ class Estimator:
 
     # factors of providers, for those that have any
 
-    def set_frame(self, frame: Frame | None, origin: FloatArray) -> None:
+    def set_frame(self, frame: Frame | None, origin: FloatArray) -> None:  # noqa: B027 -- for those with providers
         """Set the frame that providers see, and the origin (2,) of the states' positions in the world, m."""
 
-    def ask_providers(self) -> None:
+    def ask_providers(self) -> None:  # noqa: B027
         """Take in the factors of all providers, once a frame."""
 
     def extend(self, providers: Sequence[FactorProvider]) -> None:
@@ -206,12 +201,6 @@ class Estimator:
 
     def _own_attributes(self) -> dict[str, Any]:
         return deepcopy({name: value for name, value in vars(self).items() if name != "providers"})
-
-
-def missing(estimator: Estimator, poses: bool = False) -> list[str]:
-    """Names of methods that an estimator lacks; with `poses`, of those too that an estimated ego pose needs."""
-    needed = (*ESSENTIAL, *(POSES if poses else ()))
-    return [name for name in needed if getattr(type(estimator), name) is getattr(Estimator, name)]
 
 
 def _kind(estimator: object) -> str:

@@ -67,7 +67,6 @@ class IncrementalSmoother:
         self.providers = tuple(providers)
         self.origin = np.zeros(2)  # that positions of objects are counted from, in the world, m
         self.frame: Frame | None = None  # of the present epoch
-        self.at_root = frozenset[int]()  # variables whose joint covariance is asked for often, and costs less then
         self._lag, self._settings = lag, settings or RelinearisationSettings()
         self._graph = SceneFactorGraph(elimination)
         self._engine: Engine | None = None
@@ -134,14 +133,6 @@ class IncrementalSmoother:
         first = sum(t <= since for t in self._times[1:])
         self.marginalise([key for key in self._graph.older_than(self._times[first]) if key not in kept])
         self._times = self._times[first:]
-
-    def steps(self, epochs: Iterable[tuple[float, Sequence[FactorProvider]]]) -> None:
-        """Begin several epochs, each at its time with its providers, and solve once; nothing is marginalised."""
-        graph = self._graph.copy()
-        for time, providers in epochs:
-            graph.advance(time)
-            self._ask(graph, [*predictors(providers), *providers])
-        self._move_to(graph)
 
     def extend(
         self,
@@ -268,14 +259,13 @@ class IncrementalSmoother:
         engine, self._engine = self._engine, None  # it is begun anew, should it fail
         start = graph.point().values
         if engine is None or engine.elimination != graph.elimination or engine.holds_others(graph):
-            engine = Engine(graph.elimination, settings.wildfire, in_time=self._lag is not None)
-        engine.at_root = self.at_root
+            engine = Engine(graph.elimination, in_time=self._lag is not None)
         try:
             engine = engine.solved(graph, settings)
         except GraphError:
             if graph.elimination == "qr":
                 raise
             graph.moved_to(start)  # Cholesky has half the digits
-            engine = Engine("qr", settings.wildfire, in_time=self._lag is not None).solved(graph, settings)
+            engine = Engine("qr", in_time=self._lag is not None).solved(graph, settings)
         self._unsettled = engine.unsettled
         return engine

@@ -102,8 +102,6 @@ class IndependentObjects:
     def updated(self, measured: Measurements) -> IndependentObjects:
         """Take in measurements made now."""
         last = self.epochs[-1]
-        if len(measured) == 0:
-            return self
         x, _ = corrected(last.x, measured.linearised(last.x.layout, last.x.mean))
         return self._with_newest(replace(last, x=x, measurements=(*last.measurements, measured)))
 

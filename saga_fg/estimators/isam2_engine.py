@@ -29,7 +29,7 @@ from factors.gaussian import Elimination, block_covariances, native_factor, sing
 from saga_fg.estimators.relinearisation import Displacements, solve_damped
 from saga_fg.graph import GraphError, HeldGroup, SceneFactorGraph, UndeterminedError, insert_state, solver_error
 from saga_fg.numerics import FloatArray, IntArray
-from saga_fg.settings import NonNegative, Positive, Range, Settings, setting
+from saga_fg.settings import Positive, Range, Settings, setting
 
 _FEW = 24  # variables that GTSAM eliminates as quickly one after the other
 _MANY = 0.5  # share of the variables; iSAM2 eliminates all anew from 0.65 on, in an order of its own
@@ -48,10 +48,6 @@ class RelinearisationSettings(Settings):
     max_iterations: Annotated[int, Range(1, 1000)] = setting(
         25, "largest number of linearisations in a frame, before damped steps take over"
     )
-    wildfire: NonNegative = setting(
-        0.0,
-        "change of a variable, in its unit, below which those that depend on it stay; higher: faster on long drives",
-    )
 
 
 class _Taken(Exception):  # noqa: N818 -- it ends a query of GTSAM's that has told what is needed
@@ -61,10 +57,10 @@ class _Taken(Exception):  # noqa: N818 -- it ends a query of GTSAM's that has to
 class Engine:
     """iSAM2, and which of its factors are which rows of the graph's groups."""
 
-    def __init__(self, elimination: Elimination, wildfire: float = 0.0, in_time: bool = False) -> None:
+    def __init__(self, elimination: Elimination, in_time: bool = False) -> None:
         parameters = gtsam.ISAM2Params()
         parameters.setFactorization(elimination.upper())
-        parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(wildfire))
+        parameters.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
         parameters.enableRelinearization = False
         parameters.findUnusedFactorSlots = True
         self.isam, self.elimination, self.in_time = gtsam.ISAM2(parameters), elimination, in_time
@@ -76,8 +72,6 @@ class Engine:
         self._times: dict[int, float] = {}  # times of all variables, s, in whose order the tree has been eliminated
         self._births: dict[int, int] = {}  # of the variables that it has
         self._hints: dict[int, frozenset[int]] = {}  # keys of factors without information, by slot; see `_hinted`
-        self.at_root = frozenset[int]()  # variables to hold there beside the newest
-        self._held_at_root = frozenset[int]()  # at the last update
 
     def solved(self, graph: SceneFactorGraph, settings: RelinearisationSettings) -> Engine:
         """The engine with everything that has changed in the graph, which moves to the solution."""
@@ -94,8 +88,7 @@ class Engine:
         except GraphError as error:  # where it got to a factor may not be defined
             log.info("at %.3f s: %s", graph.time, error)
         graph.moved_to(start)
-        restarted = Engine(graph.elimination, settings.wildfire, self.in_time)
-        restarted.at_root = self.at_root
+        restarted = Engine(graph.elimination, self.in_time)
         found = solve_damped(graph, settings.threshold)
         restarted.unsettled = found.unsettled
         restarted._synchronised(graph)
@@ -283,8 +276,6 @@ class Engine:
 
     def _window_roots(self, graph: SceneFactorGraph, keys: set[int]) -> dict[int, FloatArray]:
         """R of variables in large components, by one Cholesky elimination of all factors; empty where that fails."""
-        if len(keys) <= _LARGE:
-            return {}
         label = graph.index.components()
         count = Counter(label[key] for key in keys)
         large = [key for key in keys if count[label[key]] > _LARGE]
@@ -372,24 +363,17 @@ class Engine:
         added = gtsam.LinearContainerFactor.ConvertLinearGraph(factors)
         parameters = gtsam.ISAM2UpdateParams()
         parameters.removeFactorIndices = removed
-        held = self.at_root & graph.variables.keys()
-        last = {*graph.carried_over.values(), *graph.newest, *held} & graph.variables.keys()
-        order: dict[int, int] = dict.fromkeys(last, 1)
-        again: Set[int] = held - self._held_at_root - set(new)
+        last = {*graph.carried_over.values(), *graph.newest} & graph.variables.keys()
+        order, moved, groups = dict.fromkeys(last, 1), gtsam.KeyList(), gtsam.KeyGroupMap()
         if self.in_time:
-            affected: Set[int] = graph.variables.keys()
-            if not again:  # else some are to move to the root from wherever they are
-                affected = set(self.isam.predictUpdateInfo(added, values, parameters)[0])
+            affected = set(self.isam.predictUpdateInfo(added, values, parameters)[0])
             order, again = self._eliminated_in_time(graph, last, affected, set(new))
-        moved, groups = gtsam.KeyList(), gtsam.KeyGroupMap()
-        for key in again:
-            moved.push_back(key)
+            for key in again:
+                moved.push_back(key)
+            parameters.extraReelimKeys = moved
         for key, group in order.items():
             groups.insert2(key, group)
-        if again:
-            parameters.extraReelimKeys = moved
         parameters.constrainedKeys = groups
-        self._held_at_root = held
         try:
             result = self.isam.update(added, values, parameters)
             estimate, self._delta = self.isam.calculateEstimate(), self.isam.getDelta()

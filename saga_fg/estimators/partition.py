@@ -107,11 +107,9 @@ class StateLayout:
 
     def places(self, rows: IntArray) -> IntArray:
         """Places in the joint state of rows of any sizes, stacked."""
-        if len(rows) == 0:
-            return np.empty(0, dtype=np.int64)
         dims = self.dims[rows]
-        ends = np.cumsum(dims)
-        return np.asarray(np.repeat(self.offsets[rows] - (ends - dims), dims) + np.arange(ends[-1]))
+        begins = np.cumsum(dims) - dims
+        return np.asarray(np.repeat(self.offsets[rows] - begins, dims) + np.arange(dims.sum()))
 
     def extended(self, nodes: ArrayLike, dim: int) -> StateLayout:
         """Add nodes of size `dim` at the end; raises `InputError` for an id that is here already."""
@@ -302,8 +300,6 @@ def regrouped(blocks: BlockDiagonal, old: Partition, new: Partition, source: Int
     source: for each node of `new` its row in `old`, -1 for none; a row may serve several nodes. Entries between nodes
     in different components of either partition are zero.
     """
-    if len(new.label) == 0:
-        return ()
     here, there, length = old.block_places, new.block_places, sum(p.size * p.shape[1] for p in new.groups)
     flat = regrouped_blocks(
         flat=flattened(blocks),
@@ -418,8 +414,7 @@ class BlockGaussian:
 
     def means_of(self, nodes: ArrayLike) -> FloatArray:
         """(k, d) means of nodes of equal size d, by their ids."""
-        mean: FloatArray = self.mean[self.layout.spans(self.layout.rows(nodes))]
-        return mean
+        return np.asarray(self.mean[self.layout.spans(self.layout.rows(nodes))])
 
     def covariances_of(self, nodes: ArrayLike) -> FloatArray:
         """(k, d, d) covariances of nodes of equal size d, by their ids."""
@@ -437,8 +432,7 @@ class BlockGaussian:
             return np.empty((0, 0))
         some = StateLayout(np.arange(len(rows)), self.layout.dims[rows])
         together = Partition(some, np.zeros(len(rows), dtype=np.int64))
-        joint: FloatArray = regrouped(self.blocks, self.partition, together, rows)[0][0]
-        return joint
+        return np.asarray(regrouped(self.blocks, self.partition, together, rows)[0][0])
 
     def correlated(self, rows: IntArray) -> tuple[IntArray, IntArray]:
         """Pairs of the nodes `rows` (k,), distinct, that share a component: first < second (E,), places in `rows`."""
@@ -456,8 +450,7 @@ class BlockGaussian:
         a, b = (int(dims[rows[0]]) if len(rows) else 0 for rows in (first, second))
         corner = place.start[first] + place.size[first] * place.offset[first] + place.offset[second]
         row = place.size[first][:, None, None] * np.arange(a)[:, None]
-        block: FloatArray = self.flat[corner[:, None, None] + row + np.arange(b)]
-        return block
+        return np.asarray(self.flat[corner[:, None, None] + row + np.arange(b)])
 
     def variances(self) -> FloatArray:
         """(D,)"""
@@ -473,8 +466,6 @@ def not_smaller(x: BlockGaussian, least: BlockGaussian, nodes: IntArray) -> Bloc
     Nodes that `least` does not have stay as they are.
     """
     rows, blocks = x.layout.rows(nodes[np.isin(nodes, least.layout.nodes)]), [block.copy() for block in x.blocks]
-    if len(rows) == 0:
-        return x
     partition = x.partition
     for label in np.unique(partition.label[rows]).tolist():
         mine = rows[partition.label[rows] == label]

@@ -37,7 +37,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import FactorError, ImuBias, OrientedPlane, PlanarPose, SpatialPose, Variable, Vector
+from factors import FactorError, ImuBias, OrientedPlane, PlanarPose, SingularSystemError, SpatialPose, Variable, Vector
 from factors.gaussian import native_factor
 from saga_fg.errors import InputError
 from saga_fg.numerics import FloatArray
@@ -51,15 +51,8 @@ class ProviderError(GraphError):
     """A provider of a user's raised, or gave what the graph does not take."""
 
 
-class UndeterminedError(GraphError):
+class UndeterminedError(GraphError, SingularSystemError):
     """The factors leave variables undetermined; `keys` are these variables, as far as they could be found."""
-
-    def __init__(self, message: str, keys: tuple[int, ...] = ()) -> None:
-        super().__init__(message)
-        self.keys = keys
-
-    def __reduce__(self) -> tuple[type[UndeterminedError], tuple[str, tuple[int, ...]]]:
-        return type(self), (str(self), self.keys)
 
 
 _BITS = 28

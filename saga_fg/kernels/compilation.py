@@ -32,7 +32,6 @@ _OPTIONS = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
 _SCALARS = {"f": "float64", "i": "int64", "b": "boolean", "u": "uint32"}
 _kernels: list[Kernel[Any, Any]] = []  # of the modules that were imported
 _parts: set[Callable[..., Any]] = set()  # functions that kernels of the same module call
-_listening = False
 _said: set[str] = set()
 
 
@@ -166,9 +165,11 @@ def _compiled_part(source: Callable[..., Any]) -> Any:
 
 def _argument(types: Any, kind: str) -> Any:
     scalar = getattr(types, _SCALARS[kind[0]])
-    if len(kind) == 1:
-        return scalar
-    return types.Array(scalar, int(kind[1]), "C" if kind.endswith("c") else "A", readonly=True)
+    return (
+        scalar
+        if len(kind) == 1
+        else types.Array(scalar, int(kind[1]), "C" if kind.endswith("c") else "A", readonly=True)
+    )
 
 
 def _say_once(message: str, *values: str) -> None:
@@ -177,12 +178,9 @@ def _say_once(message: str, *values: str) -> None:
         log.warning(message, *values)
 
 
+@cache
 def _announce_compilation() -> None:
     """Say once that kernels are being compiled, which takes seconds, when the first of them is not found on disk."""
-    global _listening
-    if _listening:
-        return
-    _listening = True
     event: Any = importlib.import_module("numba.core.event")
 
     class Announcement(event.Listener):  # type: ignore[misc]

@@ -279,40 +279,6 @@ def numbered_rows(characters: CodeArray) -> tuple[IntArray, IntArray]:
     return number, first[:k].copy()
 
 
-@kernel("f2 f1 f1 f1 f1 f1 f1 f3")
-def measured_covariances(
-    offset: FloatArray,
-    own: FloatArray,
-    along: FloatArray,
-    across: FloatArray,
-    velocity: FloatArray,
-    growth: FloatArray,
-    probability: FloatArray,
-    reported: FloatArray,
-) -> FloatArray:
-    """R (m, 4, 4) of positions and velocities, see `saga_fg.model.sensor.Sensor.position_covariance`.
-
-    offset (m, 2) from the sensor; deviations (m,): own, m, along and across the line of sight, shares of the range, and
-    of the velocity; growth at low scores, probability (m,); reported (m, 2, 2), in place of the sensor's where finite
-    """
-    m = len(offset)
-    R = np.zeros((m, 4, 4))
-    for k in range(m):
-        x, y = offset[k, 0], offset[k, 1]
-        factor = (1 + growth[k] * (1 - probability[k])) ** 2
-        isotropic = factor * (own[k] ** 2 + across[k] ** 2 * (x * x + y * y))
-        ray = factor * (along[k] ** 2 - across[k] ** 2)
-        if math.isfinite(reported[k, 0, 0]):
-            for a in range(2):
-                for b in range(2):
-                    R[k, a, b] = reported[k, a, b]
-        else:
-            R[k, 0, 0], R[k, 1, 1] = isotropic + ray * (x * x), isotropic + ray * (y * y)
-            R[k, 0, 1] = R[k, 1, 0] = ray * (x * y)
-        R[k, 2, 2] = R[k, 3, 3] = factor * velocity[k] ** 2
-    return R
-
-
 @kernel("f3 f1 f1 f1")
 def biased_covariances(P: FloatArray, yaw: FloatArray, scale: FloatArray, bias: FloatArray) -> FloatArray:
     """Reported covariances (n, 2, 2), m^2, of positions: scale^2 P + bias^2 u u^T, u the direction of the heading.
@@ -370,31 +336,3 @@ def speeds_ahead(
         heading[k], speed[k] = h, c * velocity[k, 0] + s * velocity[k, 1]
         variance[k] = c * c * P[k, 0, 0] + c * s * (P[k, 0, 1] + P[k, 1, 0]) + s * s * P[k, 1, 1]
     return heading, speed, variance
-
-
-@kernel("f1 b1 f1 i1 f1 f f")
-def existences(
-    before: FloatArray,
-    missed: BoolArray,
-    chance: FloatArray,
-    rows: IntArray,
-    probability: FloatArray,
-    survival: float,
-    neutral: float,
-) -> FloatArray:
-    """Existence (n,) of tracks after a frame, see `saga_fg.tracking.update`.
-
-        missed: r (1 - c) / (1 - r c) survival,   detected: odds of r times p (1 - neutral) / ((1 - p) neutral)
-
-    missed (n,) ones, by the chance (n,) to detect them; detections of a probability (k,) of the tracks `rows` (k,)
-    """
-    after = before.copy()
-    for i in range(len(before)):
-        if missed[i]:
-            after[i] = before[i] * (1 - chance[i]) / max(1 - before[i] * chance[i], 1e-9) * survival
-    for e in range(len(rows)):
-        odds = probability[e] / (1 - probability[e]) * (1 - neutral) / neutral
-        r = min(max(before[rows[e]], 1e-3), 1 - 1e-3)
-        odds *= r / (1 - r)
-        after[rows[e]] = min(max(odds / (1 + odds), 0.0), 0.999)
-    return after

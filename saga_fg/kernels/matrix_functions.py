@@ -221,22 +221,6 @@ def coupling_integrals(
     return result
 
 
-@kernel("f3 f2 i1 f1 f3 f2")
-def with_edges(
-    M: FloatArray, c: FloatArray, at: IntArray, rate: FloatArray, A_self: FloatArray, b: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """M (n, d, d) and c (n, d) with what E edges of a rate (E,) > 0 add to the nodes `at` (E,): rate A_self, rate b."""
-    d = c.shape[1]
-    sums, constants = M.copy(), c.copy()
-    for e in range(len(at)):
-        if rate[e] > 0:
-            for p in range(d):
-                constants[at[e], p] += rate[e] * b[e, p]
-                for q in range(d):
-                    sums[at[e], p, q] += rate[e] * A_self[e, p, q]
-    return sums, constants
-
-
 @kernel("f3 f3 i1 f3 f2 f3 f2 b")
 def with_motions(
     values: FloatArray,

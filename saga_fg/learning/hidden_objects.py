@@ -22,13 +22,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
-from saga_fg.estimators import Estimator
 from saga_fg.model import AccelerationLaw, EdgeRule, Interaction, Mixture, NodeTable, Pairs, Sensor, Transition
 from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, assign
 from saga_fg.tracking import (
@@ -49,15 +48,15 @@ from saga_fg.tracking import (
 from saga_fg.types import LabelledObjects, Scene
 
 
-class Marginals(Estimator):
-    """n nodes with the ids 0 to n - 1 as far as a tracker's prediction needs an estimator.
+class Marginals:
+    """n nodes with the ids 0 to n - 1, and as much of an `Estimator` as a tracker's prediction asks for.
 
     means (n, D), covariances (n, D, D): padded to the largest state
     wanted  the first so many are predicted, the others stay
     """
 
-    time: float = 0.0
-    nodes: IntArray = np.empty(0, dtype=np.int64)
+    time = 0.0
+    others = ()
 
     def __init__(self, means: FloatArray, covariances: FloatArray, wanted: int) -> None:
         self.means, self.covariances, self._wanted = means, covariances, wanted
@@ -231,9 +230,8 @@ class HiddenObjects(Columns):
 
     def sampled(self, most: int, seed: int) -> Self:
         """At most `most` of the gaps, chosen at random."""
-        if len(self) <= most:
-            return self
-        return self.select(np.sort(np.random.default_rng(seed).choice(len(self), most, replace=False)))
+        chosen = np.random.default_rng(seed).choice(len(self), min(most, len(self)), replace=False)
+        return self.select(np.sort(chosen))
 
     @classmethod
     def pooled(cls, parts: Sequence[HiddenObjects]) -> HiddenObjects:
@@ -289,7 +287,7 @@ class HiddenObjects(Columns):
                 ids = n + np.arange(len(gap))
                 parts.append(_placed(around, ids, shift[rows[gap]], s * STEP))
             scene = RecordedTracks.concatenate(parts)
-            marginals = Marginals(scene.mean, scene.P, wanted=n)
+            marginals: Any = Marginals(scene.mean, scene.P, wanted=n)
             state.rules = tuple(_Onto(rule, n) for rule in rules)
             state.time, state.table = s * STEP, scene.table
             state.joint = JointTrackState(marginals, partial(motion_of, settings))

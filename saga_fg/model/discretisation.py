@@ -40,7 +40,7 @@ import numpy as np
 import scipy.sparse
 
 from saga_fg.errors import InputError
-from saga_fg.kernels.matrix_functions import coupling_integrals, phi_and_noise, with_edges, with_motions
+from saga_fg.kernels.matrix_functions import coupling_integrals, phi_and_noise, with_motions
 from saga_fg.model.motion import NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, unchecked
@@ -265,9 +265,11 @@ def _own_dynamics(
     position = np.full(len(graph), -1)
     position[rows] = np.arange(len(rows))
     for edges in graph.edges:
-        at = position[edges.target]
-        if edges.A_self.shape[1] == M.shape[1] and len(at):
-            M, c = with_edges(M, c, at, edges.rate, edges.A_self, edges.b)
+        if edges.A_self.shape[1] == M.shape[1]:
+            acting = (edges.rate > 0).nonzero()[0]
+            at, rate = position[edges.target[acting]], edges.rate[acting, None]
+            np.add.at(M, at, rate[:, :, None] * edges.A_self[acting])
+            np.add.at(c, at, rate * edges.b[acting])
     return M, Qc, c
 
 

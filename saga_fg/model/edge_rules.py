@@ -117,8 +117,6 @@ def anticipated(nodes: NodeTable, classes: tuple[str, ...]) -> FloatArray:
     """Positions (n, 2) of all nodes, those of vehicles moved aside as far as the cones before them will push them."""
     position = nodes.position.copy()
     vehicles = np.flatnonzero(of_classes(nodes.label, classes))
-    if len(vehicles) == 0 or not of_classes(nodes.label, CONES).any():
-        return position
     line = cones_ahead(nodes, vehicles)
     pushed = np.where(line.known & (line.ahead > 0), line.demand, 0.0).max(axis=1, initial=0.0)
     pushed = np.where(line.speed > MIN_SPEED, pushed, 0.0)
@@ -141,8 +139,6 @@ def pairs_within(
 ) -> tuple[IntArray, IntArray]:
     """All pairs (E,) of different rows of two masks (n,) within `radius` m: target rows, source rows."""
     to, of = targets.nonzero()[0], sources.nonzero()[0]
-    if len(to) == 0 or len(of) < 2:
-        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     i, j = near_pairs(position[to], position[of], np.full(len(to), radius))
     target, source = to[i], of[j]
     different = target != source
@@ -221,8 +217,6 @@ class Neighbours(Settings):
     def pairs(self, nodes: NodeTable) -> Pairs:
         able = of_classes(nodes.label, self.classes) & (np.hypot(*nodes.velocity.T) >= self.min_speed)
         target, source = pairs_within(nodes.position, _acted(nodes, able), able, self.max_distance)
-        if len(target) == 0:
-            return NO_PAIRS
         _, _, variance, spread = _columns(nodes, self.information_gain)
         direction = nodes.along(target, source).direction
         found = neighbour_rates(
@@ -299,8 +293,6 @@ class Following(Settings):
         if self.cones:
             nodes = replace(nodes, position=anticipated(nodes, self.classes))
         target, source = self._ahead(nodes)
-        if len(target) == 0:
-            return NO_PAIRS
         exists, moved, variance, spread = _columns(nodes, self.information_gain)
         along = nodes.along(target, source)
         found = leader_rates(

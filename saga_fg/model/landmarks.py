@@ -7,7 +7,7 @@ The state is n . x + d = 0 in the world, n of length 1 pointing to the side that
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import gtsam
 
@@ -73,18 +73,12 @@ class PointLandmark(Settings):
 class PlaneLandmark(Settings):
     """A plane, observed as (n, d) (4,) in the frame of the pose; its noise is that of two turns (rad) and d (m)."""
 
+    pose: ClassVar[SpatialPose] = SpatialPose()
+    variable: ClassVar[OrientedPlane] = OrientedPlane()
     name: str = setting("plane", "name in files")
     density: Positive = setting(
         0.05, "expected density of landmarks, 1/(rad^2 m); higher: new landmarks are begun sooner"
     )
-
-    @property
-    def pose(self) -> SpatialPose:
-        return SpatialPose()
-
-    @property
-    def variable(self) -> OrientedPlane:
-        return OrientedPlane()
 
     def factors(self, rows: IntArray, observed: FloatArray, covariances: FloatArray) -> list[gtsam.NonlinearFactor]:
         return [
@@ -104,16 +98,10 @@ class PlaneLandmark(Settings):
 class PoleLandmark(Settings):
     """A pole, observed as a point (3,) on it in the frame of the pose; its noise is that ahead and to the left."""
 
+    pose: ClassVar[SpatialPose] = SpatialPose()
+    variable: ClassVar[Vector] = Vector(2)
     name: str = setting("pole", "name in files")
     density: Positive = setting(0.02, "expected density of landmarks, 1/m^2; higher: new landmarks are begun sooner")
-
-    @property
-    def pose(self) -> SpatialPose:
-        return SpatialPose()
-
-    @property
-    def variable(self) -> Vector:
-        return Vector(2)
 
     def factors(self, rows: IntArray, observed: FloatArray, covariances: FloatArray) -> list[ResidualFactors]:
         return [relative_factors(rows, observed, covariances, 2)]

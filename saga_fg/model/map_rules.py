@@ -57,11 +57,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
-from saga_fg.model.edge_rules import CLEARANCE, CONES, MIN_SPEED, Pairs, anticipated, cones_ahead
+from saga_fg.model.edge_rules import CLEARANCE, MIN_SPEED, Pairs, anticipated, cones_ahead
 from saga_fg.model.interactions import (
     POSITION,
     VELOCITY,
@@ -80,7 +80,7 @@ from saga_fg.model.nonlinear_interactions import (
     accelerated,
     speed_along,
 )
-from saga_fg.numerics import BoolArray, FloatArray, IntArray, direction_at, feet, of_classes, on_it, wrap_angle
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, direction_at, feet, of_classes, on_it, wrap_angle
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 from saga_fg.types import LANE, LIGHT, STOP_LINE, VEHICLES, LanesAcross
 
@@ -93,7 +93,8 @@ CROSSING_SPEED = 10.0  # m/s, at which vehicles of a discharged queue cross a li
 START_RATE = 0.2  # 1/s; by it the first acceleration is 2 m/s^2
 
 
-class Approach(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Approach(Columns):
     """E pairs of a vehicle and a stop line: whether it comes to it, the distance to it from the centre, along the
     lane, m, the direction of the lane at the vehicle (E, 2), and where it will cross the line, m left of its middle.
     """
@@ -102,10 +103,6 @@ class Approach(NamedTuple):
     distance: FloatArray
     direction: FloatArray
     crossing: FloatArray
-
-    def select(self, rows: IntArray | BoolArray) -> Approach:
-        """Some of the pairs."""
-        return Approach(self.comes[rows], self.distance[rows], self.direction[rows], self.crossing[rows])
 
 
 def approach(nodes: NodeTable, target: IntArray, source: IntArray) -> Approach:
@@ -152,7 +149,8 @@ def _follow_lanes(found: Approach, nodes: NodeTable, lanes: LanesAcross, target:
     found.direction[row], found.comes[row] = at.direction, lanes.s[crossed] > at.s
 
 
-class ComingVehicles(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class ComingVehicles(Columns):
     """E pairs of a vehicle that comes to a stop line and the line (rows of a `NodeTable`), with the approach, the speed
     along it, m/s, and the distance left to the front of the vehicle, m, negative where it is past the line."""
 
@@ -161,12 +159,6 @@ class ComingVehicles(NamedTuple):
     approach: Approach
     speed: FloatArray
     front: FloatArray
-
-    def select(self, rows: IntArray | BoolArray) -> ComingVehicles:
-        """Some of the pairs."""
-        return ComingVehicles(
-            self.target[rows], self.source[rows], self.approach.select(rows), self.speed[rows], self.front[rows]
-        )
 
     def first(self) -> ComingVehicles:
         """The first vehicle of each lane."""
@@ -435,9 +427,6 @@ class ConeLine:
 
     def pairs(self, nodes: NodeTable) -> Pairs:
         vehicles = np.flatnonzero(of_classes(nodes.label, self.classes))
-        none = Pairs(vehicles[:0], vehicles[:0], np.empty(0))
-        if len(vehicles) == 0 or not of_classes(nodes.label, CONES).any():
-            return none
         line = cones_ahead(nodes, vehicles)
         distance = PREVIEW * line.speed
         before = (line.known & (line.ahead <= distance[:, None])).sum(axis=1)  # cones up to where the driver looks

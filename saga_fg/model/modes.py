@@ -34,7 +34,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -45,7 +45,7 @@ from saga_fg.model.interactions import POSITION, VELOCITY
 from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, NodeType
 from saga_fg.model.scene_graph import OwnMotions, SceneGraph
 from saga_fg.model.turning import CoordinatedTurn
-from saga_fg.numerics import FloatArray, IntArray
+from saga_fg.numerics import Columns, FloatArray, IntArray
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 
 _UNUSED_DEVIATION = 0.3  # standard deviation of a component, in its unit, while its mode does not use it
@@ -131,46 +131,26 @@ class ModeDynamics(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class ModeTable:
+class ModeTable(Columns):
     """The modes of n nodes that move by one mixture: ids (n,), weight (n, M), mean (n, M, d), P (n, M, d, d).
 
     shift (n, d), spread (n, d, d): by how much mean and covariance of the mixtures are ahead of those in a joint state
     """
 
-    mixture: Mixture
     ids: IntArray
     weight: FloatArray
     mean: FloatArray
     P: FloatArray
     shift: FloatArray
     spread: FloatArray
+    mixture: Mixture
 
     @staticmethod
     def new(mixture: Mixture, ids: IntArray, mean: FloatArray, P: FloatArray) -> ModeTable:
         """Nodes of which every mode is as likely: mean (n, d), P (n, d, d)."""
         n, M = len(ids), len(mixture.motions)
         tiled = np.repeat(mean[:, None], M, axis=1), np.repeat(P[:, None], M, axis=1)
-        return ModeTable(mixture, ids, np.full((n, M), 1 / M), *tiled, np.zeros_like(mean), np.zeros_like(P))
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def extended(self, other: ModeTable) -> ModeTable:
-        """With further nodes."""
-        pairs = zip(self._columns, other._columns, strict=True)
-        return ModeTable(self.mixture, *(np.concatenate(pair) for pair in pairs))
-
-    def select(self, rows: IntArray) -> ModeTable:
-        """Some nodes."""
-        return ModeTable(self.mixture, *(column[rows] for column in self._columns))
-
-    def renamed(self, ids: IntArray) -> ModeTable:
-        """With other ids (n,)."""
-        return ModeTable(self.mixture, ids, *self._columns[1:])
-
-    @property
-    def _columns(self) -> tuple[Any, ...]:
-        return self.ids, self.weight, self.mean, self.P, self.shift, self.spread
+        return ModeTable(ids, np.full((n, M), 1 / M), *tiled, np.zeros_like(mean), np.zeros_like(P), mixture)
 
     @cached_property
     def moments(self) -> tuple[FloatArray, FloatArray]:
@@ -196,7 +176,7 @@ class ModeTable:
         mean = (F @ start[..., None])[..., 0] + c
         P = F @ P0 @ np.swapaxes(F, -1, -2) + Q
         level = np.zeros_like(self.shift), np.zeros_like(self.spread)
-        later = ModeTable(self.mixture, self.ids, weight, mean, P, *level)
+        later = ModeTable(self.ids, weight, mean, P, *level, self.mixture)
         own = self._matched(w, weight, ModeDynamics(F, c, Q))
         ahead = own.F @ self.spread @ np.swapaxes(own.F, 1, 2)
         return later, OwnMotions(own.F, own.b + (own.F @ self.shift[..., None])[..., 0], own.Q + ahead)
@@ -222,11 +202,12 @@ class ModeTable:
         P = P - np.swapaxes(gain_T, -1, -2) @ S @ gain_T
         before, after = (self.moments[0][rows], self.moments[1][rows]), _mixture_moments(weight, m, P)
         equivalent, directions, shift, spread = _equivalent(*before, *after)
-        columns = [column.copy() for column in self._columns]
-        changed = weight, m, P, self.shift[rows] + shift, self.spread[rows] + spread
-        for column, values in zip(columns[1:], changed, strict=True):
-            column[rows] = values
-        return ModeTable(self.mixture, *columns), equivalent, directions
+        later = self.copied()
+        changed = {"weight": weight, "mean": m, "P": P}
+        changed |= {"shift": self.shift[rows] + shift, "spread": self.spread[rows] + spread}
+        for name, values in changed.items():
+            vars(later)[name][rows] = values
+        return later, equivalent, directions
 
     @cached_property
     def _row(self) -> dict[int, int]:

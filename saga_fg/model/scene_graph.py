@@ -18,7 +18,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.model.motion import NodeType, distinct_types
 from saga_fg.model.nonlinear_interactions import AccelerationLaw
 from saga_fg.numerics import FloatArray, IntArray, checked, checked_ids, checked_rows
@@ -118,20 +118,6 @@ def _checked_ends(edges: Edges | NonlinearEdges) -> tuple[str, int]:
     return what, count
 
 
-def _require_groups(name: str, groups: object, kind: type[Edges] | type[NonlinearEdges]) -> None:
-    """Raise `InputError` unless `groups` are a tuple or list of edges of this kind."""
-    wanted = f"{name}: expected a tuple of {kind.__name__}"
-    if not isinstance(groups, tuple | list):
-        raise InputError(f"{wanted}, got {type(groups).__name__}")
-    for group in groups:
-        if isinstance(group, NonlinearEdges) and kind is Edges:
-            raise InputError(f"{wanted}, got NonlinearEdges of {group.interaction}, which belong in `nonlinear`")
-        if isinstance(group, Edges) and kind is NonlinearEdges:
-            raise InputError(f"{wanted}, got Edges of {group.interaction}, which belong in `edges`")
-        if not isinstance(group, kind):
-            raise InputError(f"{wanted}, got one of {type(group).__name__}")
-
-
 @dataclass(frozen=True, eq=False)
 class SceneGraph:
     """Nodes and edges at the start of an interval.
@@ -157,8 +143,10 @@ class SceneGraph:
 
     def __post_init__(self) -> None:
         nodes = checked_ids("nodes", self.nodes)
-        _require_groups("edges", self.edges, Edges)
-        _require_groups("nonlinear", self.nonlinear, NonlinearEdges)
+        for name, kind in (("edges", Edges), ("nonlinear", NonlinearEdges)):
+            require_type(name, getattr(self, name), tuple, list)
+            for k, group in enumerate(getattr(self, name)):
+                require_type(f"{name}[{k}]", group, kind)
         vars(self).update(nodes=nodes, types=tuple(self.types))
         if len(self.types) != len(nodes):
             raise InputError(f"types: expected {len(nodes)} node types, got {len(self.types)}")
@@ -216,8 +204,6 @@ class SceneGraph:
 
     def rows(self, nodes: IntArray) -> IntArray:
         """Rows of nodes that are in the graph."""
-        if len(self.nodes) and (self.nodes[1:] > self.nodes[:-1]).all():
-            return np.searchsorted(self.nodes, nodes)
         order = np.argsort(self.nodes)
         return np.asarray(order[np.searchsorted(self.nodes, nodes, sorter=order)])
 

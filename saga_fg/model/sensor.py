@@ -29,7 +29,6 @@ from typing import Annotated, Literal, Protocol
 import numpy as np
 
 from saga_fg.errors import InputError, require_type
-from saga_fg.kernels.components import measured_covariances
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray, checked, distinct, wrap_angle, yaw_transform
 from saga_fg.parts import part_kind
 from saga_fg.settings import (
@@ -270,7 +269,14 @@ class Sensor(Settings):
         """R (N, 4, 4) at offsets (N, 2) from the sensor; `reported` (N, 2, 2) of positions, where finite."""
         names = "position", "range_noise", "bearing_noise", "velocity", "low_score_growth"
         own, along, across, velocity, growth = self.deviations(label, *names)
-        return measured_covariances(offset, own, along, across, velocity, growth, probability, reported)
+        factor, (x, y), R = (1 + growth * (1 - probability)) ** 2, offset.T, np.zeros((len(label), 4, 4))
+        isotropic, ray = factor * (own**2 + across**2 * (x * x + y * y)), factor * (along**2 - across**2)
+        R[:, 0, 0], R[:, 1, 1] = isotropic + ray * (x * x), isotropic + ray * (y * y)
+        R[:, 0, 1] = R[:, 1, 0] = ray * (x * y)
+        R[:, 2, 2] = R[:, 3, 3] = factor * velocity**2
+        known = np.isfinite(reported[:, 0, 0])
+        R[known, :2, :2] = reported[known]
+        return R
 
     def range_rate_variance(self, label: StrArray, probability: FloatArray) -> FloatArray:
         """(N,), (m/s)^2."""

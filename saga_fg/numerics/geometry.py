@@ -19,6 +19,7 @@ Quantiles of the chi-square distribution: gates, and ellipses that hold a given 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -28,7 +29,7 @@ from scipy.special import gammaincinv
 
 from saga_fg.errors import InputError
 from saga_fg.kernels.pairs import compared_pairs
-from saga_fg.numerics.arrays import BoolArray, FloatArray, IntArray, checked
+from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray, checked
 
 
 def wrap_angle(angle: ArrayLike) -> FloatArray:
@@ -192,17 +193,14 @@ def in_plane(T: FloatArray) -> FloatArray:
     return T[..., rows[:, None], rows]
 
 
-class Feet(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Feet(Columns):
     """Nearest points (m, 2) of a polyline to m places, s (m,) and e (m,), m, and its direction (m, 2) at s."""
 
     point: FloatArray
     s: FloatArray
     e: FloatArray
     direction: FloatArray
-
-    def select(self, rows: IntArray | BoolArray) -> Feet:
-        """The feet of some rows."""
-        return Feet(*(column[rows] for column in self))
 
 
 class Polylines(NamedTuple):

@@ -36,6 +36,7 @@ Transactions on Aerospace and Electronic Systems 50(4), 2014: marginals by belie
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +46,7 @@ from saga_fg.kernels.pairs import gated_pairs
 from saga_fg.kernels.tracks import association_marginals
 from saga_fg.numerics import (
     BoolArray,
+    Columns,
     CrossCovariances,
     FloatArray,
     IntArray,
@@ -73,7 +75,8 @@ LARGEST_EXACT, SWEEPS = 8, 100  # tracks or detections of a cluster whose joint 
 _SURE = 20.0  # log weight of a pair of which both sides are hardly ever apart
 
 
-class CandidatePairs(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class CandidatePairs(Columns):
     """K pairs that may be matched.
 
     track, detection  (K,) rows
@@ -88,9 +91,6 @@ class CandidatePairs(NamedTuple):
     S: FloatArray
     d2: FloatArray
     gain: FloatArray
-
-    def select(self, rows: IntArray) -> CandidatePairs:
-        return CandidatePairs._make(column[rows] for column in self)
 
 
 def associate(state: TrackerState, measurements: FrameMeasurements) -> tuple[Matching, IntArray]:
@@ -177,7 +177,7 @@ def match(
     """
     found = _candidates(tracks, measurements, settings, clutter_area)
     if last is not None and tracks.id is not None and (last >= 0).any():
-        found = found._replace(gain=found.gain + identity_cost(found.track, found.detection, tracks.id, last))
+        found = replace(found, gain=found.gain + identity_cost(found.track, found.detection, tracks.id, last))
     late = np.zeros(len(found.track), dtype=bool) if tracks.deferred is None else tracks.deferred[found.track]
     first = found if not late.any() else found.select(np.flatnonzero(~late))
     chosen = _chosen(first, settings.association, tracks.cross)
@@ -247,14 +247,14 @@ def _candidates(
     )
     found = CandidatePairs(*pairs)
     if tracks.own_cost is not None:
-        found = found._replace(gain=found.gain + tracks.own_cost[found.track, found.detection])
+        found = replace(found, gain=found.gain + tracks.own_cost[found.track, found.detection])
         found = found.select(np.flatnonzero(found.gain < math.inf))
     if tracks.class_belief is not None and len(confused):
         reported = measurements.class_likelihood[found.detection]
-        found = found._replace(gain=found.gain - 2 * confused.log_evidence(tracks.class_belief[found.track], reported))
+        found = replace(found, gain=found.gain - 2 * confused.log_evidence(tracks.class_belief[found.track], reported))
         (of_detection,) = common_numbers(detected.label)
     unmatched = _unmatched(found, tracks.chance, measurements.probability, of_detection, clutter_area)
-    return found._replace(gain=found.gain - unmatched)
+    return replace(found, gain=found.gain - unmatched)
 
 
 def _unmatched(

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 from saga_fg.errors import InputError
-from saga_fg.estimators import Estimator, GraphFilter, JointKalmanFilter, missing
+from saga_fg.estimators import Estimator, GraphFilter, JointKalmanFilter
 from saga_fg.graph import FactorProvider
 from saga_fg.parts import find, made, part_kind, require_name
 
@@ -65,12 +65,12 @@ def new_estimator(
         raise InputError(f"{where}: expected parameters that are settings of the tracker, got {', '.join(unknown)}")
     if providers and all(one.name != "providers" for one in parameters):
         raise InputError(f"{where}: expected no factor providers, it has no parameter `providers`")
+    if lacking := sorted(getattr(made_by, "__abstractmethods__", ())):
+        raise InputError(f"{where}: lacks {', '.join(lacking)} of saga_fg.estimators.Estimator")
     estimator = made(where, made_by, **{one.name: values[one.name] for one in parameters if one.name in values})
     if not isinstance(estimator, Estimator):
         raise InputError(f"{where}: expected a class derived from saga_fg.estimators.Estimator, got {estimator!r:.60}")
-    if lacking := missing(estimator):
-        raise InputError(f"{where}: lacks {', '.join(lacking)} of saga_fg.estimators.Estimator")
-    if poses and missing(estimator, poses=True):
+    if poses and type(estimator).extend is Estimator.extend:
         raise InputError(f"ego.estimated: expected the estimator isam2 or fixed-lag, got {estimator_name(given)}")
     return estimator
 

@@ -280,15 +280,11 @@ def _consensus(
 
 def _candidates(a: SeenObjects, b: SeenObjects, known: PairSamples) -> tuple[FloatArray, FloatArray]:
     """Samples of the offset of sensor a less that of b, and their variances: of each object of `a` the best one."""
-    if len(a.label) == 0 or len(b.label) == 0:
-        return EMPTY, EMPTY
     moving_a, moving_b = _moving(a), _moving(b)
     velocity = np.where(moving_a[:, None, None], a.velocity[:, None], b.velocity[None])
     of_velocity = np.where(moving_a[:, None], a.velocity_variance[:, None], b.velocity_variance[None])
     possible = (a.label[:, None] == b.label[None]) & (moving_a[:, None] | moving_b[None])
     i, j = possible.nonzero()
-    if len(i) == 0:
-        return EMPTY, EMPTY
     v, apart = velocity[i, j], a.position[i] - b.position[j]
     speed2 = (v**2).sum(axis=1)
     along = (apart * v).sum(axis=1) / speed2

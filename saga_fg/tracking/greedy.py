@@ -188,8 +188,6 @@ class GreedyTracker:
         """(m,) row of the track each detection takes, or -1."""
         match = np.full(len(boxes), -1, dtype=np.int64)
         memory = self._memory
-        if len(memory.id) == 0 or len(boxes) == 0:
-            return match
         projected = memory.position[:, :2] + memory.velocity * (now - memory.last_seen)[:, None]
         limit = class_numbers(self.settings.max_distance, lambda: GreedySettings().max_distance[DEFAULT], boxes.label)
         d, t = near_pairs(boxes.position[:, :2], projected, limit * (1 + 1e-9))

@@ -78,8 +78,6 @@ class HaltingPlaces:
 
     def across(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
         """(E,) probability that a line ends the edge from `source` to `target`, rows of nodes: halts between them."""
-        if len(self.lines) == 0:
-            return np.zeros(len(target))
         own, other = (self.lines.beyond(nodes.position[rows]) for rows in (target, source))
         near = self.lines.approached(nodes.position[target], nodes.heading[target])
         between = near & (own > -BEFORE) & (own < BEYOND) & (other > BEYOND)
@@ -109,8 +107,6 @@ class HaltingPlaces:
 
     def _crossings(self, ids: list[int], position: FloatArray, heading: FloatArray) -> HaltingPlaces:
         """With the vehicles that have crossed lines since, which have not halted there."""
-        if len(self.lines) == 0:
-            return self
         now, near = self.lines.beyond(position), self.lines.approached(position, heading)
         crossed = self.lines.crossed.copy()
         for row, node in enumerate(ids):

@@ -107,7 +107,7 @@ class JointTrackState:
                 mean, P = mean @ F.T, F @ P @ F.T + Q
             if isinstance(node_type.motion, Mixture):
                 new, old = ModeTable.new(node_type.motion, ids[rows], mean, P), self._modes.get(node_type.motion)
-                self._modes[node_type.motion] = new if old is None else old.extended(new)
+                self._modes[node_type.motion] = new if old is None else old.append(new)
             labels = dict(zip(ids[rows].tolist(), label[rows].tolist(), strict=True))
             self._estimator_to_change().add_unchecked(ids[rows], mean, P, labels)
         self._initiated.update(dict.fromkeys(ids.tolist(), self.estimator.time))
@@ -156,7 +156,7 @@ class JointTrackState:
         for k, (mean, P) in enumerate(states):
             to = ids[1 - k : 2 - k]
             self._estimator_to_change().add_unchecked(to, mean, P, {int(to[0]): str(label[k])})
-        self._modes = {k: table.renamed(exchanged(table.ids, a, b)) for k, table in modes.items()}
+        self._modes = {k: replace(table, ids=exchanged(table.ids, a, b)) for k, table in modes.items()}
         self._initiated.update(dict.fromkeys((a, b), self.estimator.time))
 
     def predict(self, graph: SceneGraph, dt: float) -> None:

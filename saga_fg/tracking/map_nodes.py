@@ -267,9 +267,8 @@ def _first(rules: Sequence[EdgeRule], kind: type[Rule]) -> Rule | None:
 
 def motion_of(settings: TrackerSettings, label: str) -> Motion:
     """Own motion of a class: nodes of the map are stationary unless the settings name their class."""
-    if label in MAP_CLASSES and label not in settings.classes:
-        return RandomWalk()
-    return class_settings(settings.classes, ClassSettings, label).motion
+    of_map = label in MAP_CLASSES and label not in settings.classes
+    return RandomWalk() if of_map else class_settings(settings.classes, ClassSettings, label).motion
 
 
 def classes_read(rules: Sequence[EdgeRule]) -> tuple[str, ...]:

@@ -173,8 +173,6 @@ def suppress_duplicates(
     position = boxes.position[:, :2]
     a, b = near_pairs(position, position, np.full(len(boxes), max(distance.max(), weak_distance.max())))
     once = (a < b).nonzero()[0]
-    if len(once) == 0:
-        return into
     a, b = a[once], b[once]
     apart = np.hypot(*(position[a] - position[b]).T)
     swap = probability[b] > probability[a]

@@ -121,9 +121,8 @@ def node_table(state: TrackerState, paths: Paths | None = None) -> NodeTable:
         paths=paths,
     )
     nodes = tracks.append(state.ego.table(state.joint)) if len(state.ego) else tracks
-    if len(state.map_nodes) == 0:
-        return nodes
-    return nodes.append(state.map_nodes.table(len(nodes), state.origin, state.joint))
+    here = state.map_nodes
+    return nodes.append(here.table(len(nodes), state.origin, state.joint)) if len(here) else nodes
 
 
 def look_ahead(state: TrackerState, horizons: FloatArray, joint: bool = False) -> PredictedTracks:

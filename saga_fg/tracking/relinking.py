@@ -46,14 +46,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from saga_fg.kernels.pairs import relinking_pairs, return_evidence, returned_pairs
-from saga_fg.kernels.tracks import log_peaks
+from saga_fg.kernels.pairs import return_evidence
 from saga_fg.model import POSITION, VELOCITY
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, Matching, StrArray, least_total, mahalanobis_of_pairs
 from saga_fg.tracking.measurements import FrameMeasurements
+from saga_fg.tracking.track_filters import log_density
 from saga_fg.tracking.tracker_state import LIFETIME, TrackerState
 
-_ROUNDING = 1 + 1e-6
 CONFIRMING = 3  # detections that confirm a track of one sensor, and up to which it may be an earlier one; usual 2 to 5
 NOMINAL_AREA = 5000.0  # m^2, where `clutter_area` is infinite: a disc of 40 m, in which most objects are detected
 _FARTHEST = 100.0  # squared distance of two positions from which not even the narrowest densities join tracks
@@ -87,8 +86,6 @@ def relinked(
     if own_cost is not None:
         cost = cost + own_cost[t, rows[j]] / 2
     t, j, cost = t[cost < 0], j[cost < 0], cost[cost < 0]
-    if len(t) == 0:
-        return matching
     chosen = least_total(t, j, cost)
     t, j = t[chosen], j[chosen]
     distance, _ = mahalanobis_of_pairs(places[j] - position[t], P[t] + noise[j])
@@ -108,23 +105,23 @@ def _pairs(
     that re-linking pays for."""
     still = state.table.stationarity
     group, of_place = state.confused.numbers(state.table.label, label)
-    log_density = np.log(np.bincount(of_place)[of_place] / area(state))
-    return relinking_pairs(
-        tracks=tracks,
-        group=group,
-        position=position,
-        P=P,
-        place=still.position,
-        D=still.P,
-        stationary=still.probability,
-        log_survival=log_survival(state),
-        z=z,
-        R=R,
-        group_z=of_place,
-        log_density=log_density,
-        least=min_log_odds(state),
-        rounding=_ROUNDING,
+    row, j = (group[tracks, None] == of_place).nonzero()
+    t, log_others = tracks[row], np.log(np.bincount(of_place)[of_place] / area(state))
+    moving, resting = (
+        log_density(z[j] - mean[t], C[t] + R[j]) for mean, C in ((position, P), (still.position, still.P))
     )
+    log_density_of_track = log_survival(state)[t] + _log_mixture(still.probability[t], moving, resting)
+    cost = min_log_odds(state) - (log_density_of_track - log_others[j])
+    paying = cost < 0
+    return t[paying], j[paying], cost[paying]
+
+
+def _log_mixture(stationary: FloatArray, moving: FloatArray, resting: FloatArray) -> FloatArray:
+    """(k,) log of a density in the plane, of logs (k,) up to a constant: moving, and resting, with the probability
+    `stationary` (k,)."""
+    s = np.clip(stationary, 0.0, 1 - 1e-9)
+    mixed = np.logaddexp(np.log1p(-s) + moving, np.log(np.maximum(s, 1e-300)) + resting)
+    return np.asarray(mixed - math.log(2 * math.pi))
 
 
 def _class_odds(state: TrackerState, tracks: IntArray, likelihood: FloatArray) -> FloatArray:
@@ -141,7 +138,8 @@ def relinkable(state: TrackerState) -> BoolArray:
     if association.relink_above == 1 or len(table) == 0:
         return np.zeros(len(table), dtype=bool)
     still = table.stationarity
-    peaks = log_peaks(state.kinematics().P, still.P, still.probability, log_survival(state))
+    moving, resting = (log_density(np.zeros(2), C) for C in (state.kinematics().P, still.P))
+    peaks = log_survival(state) + _log_mixture(still.probability, moving, resting)
     within = table.coasting(state.time) <= state.settings.max_coasting
     return np.asarray(within & (peaks >= min_log_odds(state) - math.log(area(state))))
 
@@ -151,8 +149,7 @@ def initiating(state: TrackerState, measurements: FrameMeasurements, matching: M
     free = np.ones(len(measurements), dtype=bool)
     free[matching.detection] = False
     initiation_score = state.class_values(measurements.boxes.label, "initiation_score")[0]
-    probable: IntArray = (free & (measurements.probability >= initiation_score)).nonzero()[0]
-    return probable
+    return np.asarray((free & (measurements.probability >= initiation_score)).nonzero()[0])
 
 
 def area(state: TrackerState) -> float:
@@ -204,23 +201,18 @@ def _possible_returns(state: TrackerState, matching: Matching) -> tuple[IntArray
     detected[matching.track] = settings.association.relink_above < 1
     detections = table.sensors.hits.sum(axis=1)
     new = (detected & resolved & (detections > 1) & (detections <= CONFIRMING)).nonzero()[0]
-    if len(new) == 0:
-        return new, new, new
     old = (~detected & resolved & (table.coasting(state.time) <= settings.max_coasting)).nonzero()[0]
     now, still = state.kinematics(), table.stationarity
     (group,) = state.confused.numbers(table.label)
-    return returned_pairs(
-        new=new,
-        old=old,
-        group=group,
-        initiated=table.initiated,
-        last_detected=table.last_detected,
-        position=now.position,
-        P=now.P,
-        place=still.position,
-        D=still.P,
-        farthest=_FARTHEST,
-    )
+    before = table.last_detected[old] < table.initiated[new, None]
+    row, column = (before & (group[new, None] == group[old])).nonzero()
+    a, b, others = new[row], old[column], (group[new, None] == group[new]).sum(axis=1)[row]
+    apart = [
+        mahalanobis_of_pairs(mean[a] - mean[b], C[a] + C[b])[0]
+        for mean, C in ((now.position, now.P), (still.position, still.P))
+    ]
+    near = np.minimum(*apart) < _FARTHEST
+    return a[near], b[near], others[near]
 
 
 def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[FloatArray, FloatArray]:

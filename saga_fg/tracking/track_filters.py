@@ -60,7 +60,6 @@ from saga_fg.kernels.tracks import (
     faced_boxes,
     predicted_places,
     reported_moments,
-    states_within,
     turned_headings,
     updated_boxes,
     updated_places,
@@ -112,7 +111,10 @@ class Kinematics(NamedTuple):
         Means and standard deviations have to be within `MAX_POSITION` and `MAX_SPEED`, variances of positions above 0,
         of velocities at least 0. NaN never is within.
         """
-        return states_within(self.position, self.velocity, self.P, self.P_velocity, origin, MAX_POSITION, MAX_SPEED)
+        P, P_velocity = (np.diagonal(C, axis1=1, axis2=2) for C in (self.P, self.P_velocity))
+        placed = (np.abs(self.position + origin) <= MAX_POSITION) & (P > 0) & (P <= MAX_POSITION**2)
+        slow = (np.abs(self.velocity) <= MAX_SPEED) & (P_velocity >= 0) & (P_velocity <= MAX_SPEED**2)
+        return np.asarray((placed & slow).all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -132,8 +132,6 @@ class SensorEvidence(Columns):
     def detected_by_others(self, sensor: str, now: float, memory: float) -> BoolArray:
         """(n,) which tracks another sensor has detected in the last `memory` s."""
         at = self._column(sensor)
-        if len(self.sensors) == 1:
-            return np.zeros(len(self), dtype=bool)
         seen = self.detected & (now - self.time <= memory)
         seen[:, at] = False
         return np.asarray(seen.any(axis=1))
@@ -142,16 +140,12 @@ class SensorEvidence(Columns):
         """Hits (n,) and opportunities (n,) of the sensor with the best hit ratio of each track."""
         if len(self) == 0:
             return np.empty(0), np.empty(0)
-        if len(self.sensors) == 1:
-            return self.hits[:, 0].astype(np.float64), self.opportunities[:, 0].astype(np.float64)
         best = ((self.hits + 0.0) / (self.opportunities + 1.0)).argmax(axis=1)[:, None]
         hits, total = (np.take_along_axis(count, best, axis=1)[:, 0] for count in (self.hits, self.opportunities))
         return hits.astype(np.float64), total.astype(np.float64)
 
     def confirmed(self, detections: FloatArray) -> BoolArray:
         """(n,) which tracks two sensors have detected, or one at least this often (n,)."""
-        if len(self.sensors) == 1:
-            return np.asarray(self.hits[:, 0] >= detections)
         return np.asarray(((self.hits > 0).sum(axis=1) > 1) | (self.hits.sum(axis=1) >= detections))
 
     def _column(self, sensor: str) -> int:

@@ -50,8 +50,6 @@ def unresolved_frames(
     others = Boxes.concatenate([boxes, live])
     row, column = touching_pairs(boxes, others)
     other = (column != row).nonzero()[0]  # of new ones, all touch themselves
-    if len(other) == 0:
-        return np.zeros(len(boxes))
     row, column = row[other], column[other]
     is_new = column < len(boxes)
     surer = np.empty(len(row), dtype=bool)
@@ -60,8 +58,6 @@ def unresolved_frames(
     surer[~is_new] = (state.table.unresolved[track] == 0) & (state.table.existence[track] >= probability[row[~is_new]])
     row, column = row[surer], column[surer]
     covered = _largest(_overlaps(state, boxes, others, row, column), row, len(boxes)) > OVERLAP
-    if not covered.any():
-        return np.zeros(len(boxes))
     precise = np.sqrt(np.linalg.eigvalsh(R)[:, -1]) < PRECISE * boxes.size[:, :2].min(axis=1)
     return np.where(covered & precise, FRAMES, 0.0)
 

@@ -30,9 +30,8 @@ from dataclasses import replace
 import numpy as np
 
 from factors import RangeRate
-from saga_fg.kernels.components import existences
 from saga_fg.model import POSITION, VELOCITY, own_motion
-from saga_fg.numerics import FloatArray, IntArray, Matching, StrArray, chi_square_quantile
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, Matching, StrArray, chi_square_quantile
 from saga_fg.tracking.joint_state import moved_to_present
 from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
 from saga_fg.tracking.track_filters import MOVING, Kinematics
@@ -182,6 +181,28 @@ def update_range_rates(
 
 
 SCORE_MEMORY = 0.15  # time for which the latest detection of each sensor counts in a track's score, s
+
+
+def existences(
+    before: FloatArray,
+    missed: BoolArray,
+    chance: FloatArray,
+    rows: IntArray,
+    probability: FloatArray,
+    survival: float,
+    neutral: float,
+) -> FloatArray:
+    """Existence (n,) of tracks after a frame, see the module.
+
+        missed: r (1 - c) / (1 - r c) survival,   detected: odds of r times p (1 - neutral) / ((1 - p) neutral)
+
+    missed (n,) ones, by the chance (n,) to detect them; detections of a probability (k,) of the tracks `rows` (k,)
+    """
+    after = np.where(missed, before * (1 - chance) / np.maximum(1 - before * chance, 1e-9) * survival, before)
+    r = np.clip(before[rows], 1e-3, 1 - 1e-3)
+    odds = probability / (1 - probability) * (1 - neutral) / neutral * (r / (1 - r))
+    after[rows] = np.clip(odds / (1 + odds), 0.0, 0.999)
+    return after
 
 
 def update_existence(state: TrackerState, measurements: FrameMeasurements, matching: Matching, elapsed: float) -> None:

@@ -389,8 +389,6 @@ def _position_covariances(value: FloatArray, n: int) -> FloatArray:
         return np.full((n, 2, 2), value)
     covariance = checked("position_covariance", value, (n, 2, 2), "finite-or-nan")
     known = np.flatnonzero(np.isfinite(covariance[:, 0, 0]))
-    if not len(known):
-        return covariance
     whole = covariance.copy()
     whole[known] = checked_covariances("position_covariance", covariance[known], len(known), 2)
     whole.flags.writeable = False

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from pipelines.config import load_config
 from saga_fg import Boxes, Detections, Frame, Sensor, Tracker, TrackerSettings
-from saga_fg.kernels.components import existences
 from saga_fg.model.sensor import FieldOfView, NoiseModel
 from saga_fg.numerics.arrays import Columns
 from saga_fg.numerics.geometry import yaw_transform
@@ -17,6 +16,7 @@ from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettin
 from saga_fg.tracking.reporting import LASTING_SHARE, reported_score
 from saga_fg.tracking.track_table import PRIOR_LOGIT, SensorEvidence, TrackTable
 from saga_fg.tracking.tracker_state import LIFETIME
+from saga_fg.tracking.update import existences
 from tests.saga_fg.traffic_frames import NAN, frame, run
 
 
