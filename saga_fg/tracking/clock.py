@@ -131,8 +131,7 @@ class SensorClock:
         """The time, s, from its latest frame to one with this timestamp; from its latest accepted one if that is
         nearer."""
         d = timestamp - self.stamp
-        known = self.doubt is not None and self.time is not None
-        return min(d, timestamp - self.offset - self.time, key=abs) if known else d
+        return d if self.doubt is None or self.time is None else min(d, timestamp - self.offset - self.time, key=abs)
 
     def arrived(self, timestamp: float, waited: float) -> SensorClock:
         """After a frame with this timestamp, s, `waited` s of elapsed time after the one before."""
