@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError, require_type
-from saga_fg.estimators.measurements import Measurements, Observations
+from saga_fg.estimators.filtering import Measurements, Observations
 from saga_fg.estimators.object_factors import prior_graph
 from saga_fg.estimators.partition import BlockGaussian
 from saga_fg.graph import FactorProvider, SceneFactorGraph

@@ -5,7 +5,7 @@
     lag       epochs older than this are marginalised; 0 keeps the last interval alone, which is the filter
 
 Each component of the graph is solved by what it needs. Objects that nothing ties to others are eliminated all at once,
-in closed form (`saga_fg.estimators.independent`). Objects that interactions tie, and those with a nonlinear factor, a
+in closed form (`saga_fg.estimators.graph_window`). Objects that interactions tie, and those with a nonlinear factor, a
 robust one or one of a user's provider, are variables of `gtsam.ISAM2` (`saga_fg.estimators.incremental_smoother`), and
 what is reported of them is read from its tree. An object passes from the one to the other when a first factor ties it,
 and back when no correlation with others is left.
@@ -25,10 +25,19 @@ from numpy.typing import ArrayLike
 from factors.gaussian import Elimination
 from saga_fg.errors import InputError, UnknownNodeError, require_type
 from saga_fg.estimators.estimator import Estimator
-from saga_fg.estimators.filtering import Dynamics, predict
-from saga_fg.estimators.graph_window import SAME_TIME, GraphState, GraphWindow, WholeGraph, WindowEpoch, whole_graph
+from saga_fg.estimators.filtering import Dynamics, Measured, Measurements, Observations, predict
+from saga_fg.estimators.graph_window import (
+    SAME_TIME,
+    GraphState,
+    GraphWindow,
+    IndependentObjects,
+    IndependentVariables,
+    WholeGraph,
+    WindowEpoch,
+    uncoupled,
+    whole_graph,
+)
 from saga_fg.estimators.incremental_smoother import IncrementalSmoother
-from saga_fg.estimators.independent import IndependentObjects, IndependentVariables, uncoupled
 from saga_fg.estimators.interval_dynamics import (
     IntervalDynamics,
     by_covariance,
@@ -37,7 +46,6 @@ from saga_fg.estimators.interval_dynamics import (
     replace_by_prior,
     with_noise,
 )
-from saga_fg.estimators.measurements import Measured, Measurements, Observations
 from saga_fg.estimators.object_factors import DetectionFactors, Interactions
 from saga_fg.estimators.partition import BlockGaussian, StateLayout, checked_prior, not_smaller
 from saga_fg.estimators.smoother import SmoothedState

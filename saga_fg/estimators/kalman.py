@@ -37,9 +37,17 @@ from numpy.typing import ArrayLike
 from factors import SingularSystemError
 from saga_fg.errors import InputError, require_type
 from saga_fg.estimators.estimator import Estimator
-from saga_fg.estimators.filtering import ComponentBounds, Dynamics, corrected, lost_in_rounding, predict
+from saga_fg.estimators.filtering import (
+    ComponentBounds,
+    Dynamics,
+    Measured,
+    Measurements,
+    Observations,
+    corrected,
+    lost_in_rounding,
+    predict,
+)
 from saga_fg.estimators.interval_dynamics import IntervalDynamics, replace_by_prior
-from saga_fg.estimators.measurements import Measured, Measurements, Observations
 from saga_fg.estimators.object_factors import prior_graph
 from saga_fg.estimators.partition import BlockGaussian, StateLayout, checked_prior
 from saga_fg.graph import (

@@ -27,8 +27,8 @@ from factors import (
     prior_factors,
 )
 from saga_fg.errors import InputError
+from saga_fg.estimators.filtering import Measured, Measurements, Observations
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
-from saga_fg.estimators.measurements import Measured, Measurements, Observations
 from saga_fg.estimators.partition import BlockGaussian, StateLayout
 from saga_fg.graph import Additions, GraphView, NewVariable, SceneFactorGraph, node_key, node_kind
 from saga_fg.model import Blocks, Transition

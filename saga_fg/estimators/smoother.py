@@ -34,9 +34,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
-from saga_fg.estimators.filtering import ComponentBounds, Dynamics, corrected, predict
+from saga_fg.estimators.filtering import ComponentBounds, Dynamics, Measurements, Observations, corrected, predict
 from saga_fg.estimators.interval_dynamics import IntervalDynamics
-from saga_fg.estimators.measurements import Measurements, Observations
 from saga_fg.estimators.partition import BlockDiagonal, BlockGaussian, Partition, StateLayout, checked_prior, regrouped
 from saga_fg.model import Transition
 from saga_fg.numerics import FloatArray, IntArray

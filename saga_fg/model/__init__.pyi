@@ -1,6 +1,6 @@
 from .discretisation import Blocks, Transition, discretise, own_motion
 from .edge_rules import Attached, EdgeRule, Following, Neighbours, Pairs, Repulsion, acting_classes, traffic_rules
-from .graph_building import EdgeEffect, Governing, build_graph, edge_effects
+from .graph_building import EdgeEffect, Governing, LearnedInteractions, build_graph, edge_effects, require_stable
 from .interactions import (
     POSITION,
     VELOCITY,
@@ -30,7 +30,6 @@ from .sensor import (
     checked_sensors,
     sensor_model,
 )
-from .stability import LearnedInteractions, require_stable
 from .turning import CoordinatedTurn, KnownCourses, Unseen, turning_time
 
 __all__ = [

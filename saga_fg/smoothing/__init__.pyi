@@ -22,8 +22,8 @@ from .boxes import (
     weighted_medians,
 )
 from .doubt import Review
+from .labelling import RecordingLabels
 from .recording import ChunkSettings, LabelBuilder, LabelModel
-from .recording_labels import RecordingLabels
 from .settings import (
     OfflineClass,
     SmoothingSettings,

@@ -35,12 +35,13 @@ from saga_fg.smoothing.corrections import Correction, WholeObject
 from saga_fg.smoothing.labelling import (
     Identities,
     LabelledStates,
+    LabelParts,
     ObjectSummary,
+    RecordingLabels,
     dropped_boxes,
     label_states,
 )
 from saga_fg.smoothing.passes import SmoothedObjects, smooth_objects, track_evidence
-from saga_fg.smoothing.recording_labels import LabelParts, RecordingLabels
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME, SmoothingSettings
 from saga_fg.smoothing.states import LabelCounts
 from saga_fg.tracking import GreedyTracker, Tracker, TrackerSettings, scaled_sensors

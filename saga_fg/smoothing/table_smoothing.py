@@ -9,8 +9,8 @@ import numpy as np
 
 from saga_fg.model import Sensor
 from saga_fg.smoothing.corrections import Correction, checked_corrections, corrections_in, unfit
+from saga_fg.smoothing.labelling import RecordingLabels
 from saga_fg.smoothing.recording import LabelBuilder, LabelModel
-from saga_fg.smoothing.recording_labels import RecordingLabels
 from saga_fg.smoothing.settings import SmoothingSettings
 from saga_fg.smoothing.states import Labels
 from saga_fg.tables import Table, TableImport, raw_table, scenes_of, table_like

@@ -2,14 +2,11 @@ from .by_name import estimator_parameters
 from .class_belief import ConfusedClasses
 from .clock import TimeVerdict
 from .clock_offsets import SensorTime
-from .dense_traffic import dense_traffic_settings
 from .greedy import GreedySettings, GreedyTracker
-from .identity_tracking import IdentityTracker
 from .joint_state import JointTrackState
 from .journal import Event, Journal, Observer, Stage, TrackerView, of_scene
 from .map_nodes import motion_of
-from .measurements import frame_measurements
-from .noise_scale import scaled_sensors
+from .measurements import frame_measurements, scaled_sensors
 from .prediction import predict
 from .settings import (
     AssociationCost,
@@ -22,7 +19,7 @@ from .settings import (
     TrackerSettings,
     TypicalSize,
 )
-from .table_tracking import UNKNOWN_SENSORS, check_scenes, track
+from .table_tracking import UNKNOWN_SENSORS, IdentityTracker, check_scenes, dense_traffic_settings, track
 from .track_filters import MOVING, Kinematics, TurnRate
 from .track_table import SensorEvidence, TrackTable
 from .tracker import Tracker

@@ -16,7 +16,7 @@ joint covariance of the filter, the covariance between tracks i and j is
 
 since whether an object is stationary is its own affair; the mean and the block i = j are those of
 `saga_fg.tracking.track_filters`. The calibration of reported covariances is left out: it is about the errors of
-detections (`saga_fg.tracking.reporting`), which soon are the smaller part.
+detections (`saga_fg.tracking.track_life`), which soon are the smaller part.
 """
 
 import logging
@@ -28,7 +28,7 @@ from saga_fg.model import NodeTable, Paths, build_graph
 from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.tracking.courses import known_courses, predicted_paths
 from saga_fg.tracking.edge_record import answers
-from saga_fg.tracking.reporting import reported_rows, untrackable
+from saga_fg.tracking.track_life import reported_rows, untrackable
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types import PredictedTracks
 

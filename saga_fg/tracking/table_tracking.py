@@ -1,12 +1,37 @@
-"""Tracking of a whole table of detections in one call, which refuses one whose contents contradict how it is read."""
+"""Dense road traffic, seen by a sensor that stands or hovers: its settings.
 
+Drones and roadside sensors give vehicles with headings, many at a time and often. There a vehicle keeps to its course,
+to the trails of those before it, and does what its leader does (`saga_fg.tracking.traffic`). The motion of vehicles was
+chosen on half of the windows of two recorded roads, and confirmed on the others.
+
+Tracking of a whole table of detections in one call, which refuses one whose contents contradict how it is read.
+
+A tracker in the place of those that number detections: `update(detections)`, as of supervision and `trackers`.
+"""
+
+import copy
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from functools import cache
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from saga_fg.model import Sensor, acting_classes, sensor_model
+from saga_fg.errors import InputError
+from saga_fg.model import (
+    ConstantVelocity,
+    Curvilinear,
+    Following,
+    GreenLight,
+    GroundCamera,
+    RedLight,
+    Sensor,
+    SharedVelocity,
+    Stopping,
+    acting_classes,
+    sensor_model,
+)
+from saga_fg.numerics import IntArray, checked
 from saga_fg.tables import (
     RawTable,
     Table,
@@ -18,10 +43,56 @@ from saga_fg.tables import (
     table_like,
     tell,
 )
-from saga_fg.tracking.dense_traffic import dense_traffic_settings
-from saga_fg.tracking.settings import TrackerSettings
+from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
 from saga_fg.tracking.tracker import Tracker
-from saga_fg.types import DEFAULT, Scene, Tracks
+from saga_fg.tracking.traffic import TrafficSettings
+from saga_fg.types import DEFAULT, Detections, Frame, Scene, SignalSettings, Tracks
+
+
+@cache
+def dense_traffic_settings() -> TrackerSettings:
+    """Settings of the tracker for dense road traffic, of which nothing else is known."""
+    return TrackerSettings(
+        classes={
+            DEFAULT: ClassSettings(
+                motion=Curvilinear(jerk_noise=0.3, fading_time=4.0, course_time=0.2),
+                initial_speed_deviation=8.0,
+                gate=0.99999,
+                initiation_score=0.3,
+                nms_distance=1.0,
+                max_distance=8.0,
+                max_deviation=3.0,
+            ),
+            "pedestrian": ClassSettings(
+                motion=ConstantVelocity(acceleration_noise=0.3),
+                initial_speed_deviation=1.2,
+                initial_lateral_speed_deviation=1.2,
+                gate=0.99999,
+                initiation_score=0.3,
+                nms_distance=0.3,
+                max_distance=2.0,
+                max_deviation=1.5,
+            ),
+        },
+        min_hits=2,
+        traffic=TrafficSettings(memory=60.0),
+        edges=(
+            RedLight(interaction=Stopping(margin=0.5), reaction_deceleration=0.8, full_deceleration=1.8),
+            GreenLight(),
+            Following(  # parked: all are on the road, and who was never seen moving waits in a queue
+                interaction=SharedVelocity(along_heading=True),
+                rate=1.5,
+                max_gap=60.0,
+                gap_scale=16.0,
+                lateral_scale=0.8,
+                parked=True,
+            ),
+        ),
+        edge_prior=0.95,  # edges answer for themselves: a leader who has crossed the line no longer leads
+        signals=SignalSettings(red_duration=70.0, amber_duration=3.5, green_duration=25.0, driver_noise=1.0),
+        association=AssociationSettings(clutter_area=5000.0),
+    )
+
 
 UNKNOWN_SENSORS: Mapping[str, Sensor] = {DEFAULT: Sensor(calibrate_noise=True)}
 """Models of sensors of which nothing is known: their detections tell how noisy they are."""
@@ -46,7 +117,7 @@ def track(
                  width, height, yaw (rad), vx, vy, range_rate, cov_xx, cov_xy, cov_yy (m^2), scene, and ego_x,
                  ego_y, ego_yaw, the vehicle's pose; a row without x and y is a moment at which nothing was detected
     settings     of the tracker; by default tracks are reported from their second detection on, and dense road traffic
-                 seen by a sensor that stands or hovers has settings of its own (`saga_fg.tracking.dense_traffic`)
+                 seen by a sensor that stands or hovers has settings of its own (`saga_fg.tracking.table_tracking`)
     sensors      models by name of the sensor; by default the noise of each is told by its detections
     columns      names of columns in the table, by ours, where they are not found: {"x": "pos_e"}
     classes      our name of a class by that in the table, an empty one to leave its objects out
@@ -95,3 +166,68 @@ def check_scenes(raw: RawTable, scenes: list[Scene], settings: TrackerSettings, 
     found = [one for scene in scenes for one in scene.findings or () if one.kind != "scores" or not logits]
     rules = idle_rules(acting_classes(settings.edges), labels - {UNNAMED})
     tell([*found, *([] if rules is None else [rules])], raw, depth=4)
+
+
+D = TypeVar("D")
+SENSOR = "camera"
+
+
+class IdentityTracker:
+    """Gives each detection of a frame the number of its track.
+
+    camera      places image boxes on the ground; None for detections in the world
+    frame_rate  frames per second, where `update` is told no times
+    settings    of the tracker; by default tracks are reported from their second detection on
+    sensor      the model of the detector
+    classes     names by class id; the number is the name of those left out
+    """
+
+    def __init__(
+        self,
+        camera: GroundCamera | None = None,
+        frame_rate: float = 30.0,
+        settings: TrackerSettings | None = None,
+        sensor: Sensor | None = None,
+        classes: Mapping[int, str] | None = None,
+    ) -> None:
+        if not frame_rate > 0:
+            raise InputError(f"frame_rate: expected a number > 0, got {frame_rate!r}")
+        self.camera, self.frame_rate, self.classes = camera, frame_rate, dict(classes or {})
+        self.tracker = Tracker(settings or TrackerSettings(min_hits=2), {} if sensor is None else {SENSOR: sensor})
+        self._time = 0.0
+
+    def update(self, detections: D, timestamp: float | None = None) -> D:
+        """Return the detections of the next frame with the numbers of their tracks, -1 for none; timestamp: s.
+
+        They have `xyxy` (n, 4), px, and may have `confidence` (n,) and `class_id` (n,), and are returned with
+        `tracker_id` (n,), as those of supervision; or they are `saga_fg.Detections` in the world, and are returned with
+        `identity`. Raises `InputError` for detections that are neither; the tracker is then as it was before.
+        """
+        time = self._time if timestamp is None else timestamp
+        found, rows = self._placed(detections)
+        name = "identity" if isinstance(detections, Detections) else "tracker_id"
+        tracks = self.tracker.step(Frame(time, SENSOR, found))
+        self._time = time + 1 / self.frame_rate
+        id_, row = self.tracker.assignment.id, self.tracker.assignment.detection
+        reported, numbers = np.isin(id_, tracks.id), np.full(len(getattr(detections, "xyxy", rows)), -1)
+        numbers[rows[row[reported]]] = id_[reported]
+        numbered = copy.copy(detections)
+        vars(numbered)[name] = numbers
+        return numbered
+
+    def _placed(self, detections: Any) -> tuple[Detections, IntArray]:
+        """Detections in the world, and their rows: image boxes are placed on the ground."""
+        if isinstance(detections, Detections):
+            return detections, np.arange(len(detections))
+        if self.camera is None or not hasattr(detections, "xyxy"):
+            expected = (
+                "detections with xyxy" if self.camera is not None else "saga_fg.Detections, as there is no camera"
+            )
+            raise InputError(f"detections: expected {expected}, got {type(detections).__name__}")
+        xyxy = checked("xyxy", detections.xyxy, (None, 4))
+        score, class_id = (getattr(detections, name, None) for name in ("confidence", "class_id"))
+        score = np.ones(len(xyxy)) if score is None else checked("confidence", score, (len(xyxy),))
+        numbers = [] if class_id is None else checked("class_id", class_id, (len(xyxy),)).astype(np.int64).tolist()
+        names = [UNNAMED] * len(xyxy) if class_id is None else [self.classes.get(k, str(k)) for k in numbers]
+        label = np.array(names, dtype=np.str_)
+        return self.camera.detections(xyxy, score, label)

@@ -175,7 +175,7 @@ class TrackTable(Columns):
     last_existence    (n,) its existence at its latest detection
     score             (n,) probability of its latest detection
     best_score        (n,) the highest of its detections
-    covariance_scale  (n,) factor on the reported standard deviation of the position, see `saga_fg.tracking.reporting`
+    covariance_scale  (n,) factor on the reported standard deviation of the position, see `saga_fg.tracking.track_life`
     position_bias     (n,) standard deviation of the position error that all its detections share, m
     initiated         (n,) time of its first detection
     last_detected     (n,) time of its latest detection
@@ -184,7 +184,7 @@ class TrackTable(Columns):
     required_hits     (n,) detections after which it is no longer tentative, if they are of one sensor
     overlooked        (n,) time at which a sensor whose tracks count at once last had it in view and had never detected
                       it; NaN for those that such a sensor has initiated
-    unresolved        (n,) further frames to tell it from the track that it overlaps, see `saga_fg.tracking.unresolved`
+    unresolved        (n,) further frames to tell it from the track that it overlaps, see `saga_fg.tracking.track_life`
     class_belief      (n, C) log-probabilities by its detections, see `saga_fg.tracking.class_belief`
     box               size, height and heading
     stationarity      probability and place of standing still

@@ -32,7 +32,7 @@ from pipelines.learning.interactions import CAP, JudgedRun, LearnedForms
 from saga_fg import InputError
 from saga_fg.learning.labelled_scene import Gap
 from saga_fg.model.edge_rules import Following
-from saga_fg.model.stability import LearnedInteractions
+from saga_fg.model.graph_building import LearnedInteractions
 from tests.pipelines.sampled_gaps import HIDDEN, SEEN, SHORT, TIMES, labelled, straight, tracks, without
 
 SEVEN_SECONDS = replace(SHORT, duration=7.0)

@@ -34,9 +34,9 @@ from saga_fg import ConstantVelocity
 from saga_fg.errors import InputError
 from saga_fg.learning import FittedInteractions, fit_interactions, sample_with_truth
 from saga_fg.model.edge_rules import Following, Neighbours
+from saga_fg.model.graph_building import LearnedInteractions
 from saga_fg.model.interactions import VELOCITY, CarFollowing, velocity_triples
 from saga_fg.model.sensor import NoiseModel, Sensor
-from saga_fg.model.stability import LearnedInteractions
 from saga_fg.types.by_class import DEFAULT
 from tests.pipelines.command import done, refused
 from tests.saga_fg.following_pairs import RATE, following_pairs

@@ -14,7 +14,7 @@ Per interval of dt s and d m, an increment a_T_b has independent noise
     translation  distance_noise^2 d + time_noise^2 dt,  every direction
 
 and three slow errors, a scale of the distance, a bias of the yaw rate and an angle of the course, which start as
-N(0, scale^2), N(0, bias^2), N(0, course^2) and wander as random walks (see `factors.between`).
+N(0, scale^2), N(0, bias^2), N(0, course^2) and wander as random walks (see `factors.poses`).
 """
 
 from __future__ import annotations

@@ -23,8 +23,8 @@ from saga_fg.conformance.programs import (
     random_types,
 )
 from saga_fg.model.discretisation import Blocks, Transition, discretise
+from saga_fg.model.graph_building import joint_generator
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
-from saga_fg.model.stability import joint_generator
 
 seeds = st.integers(0, 2**32 - 1)
 intervals = st.one_of(st.floats(1e-9, 1e3), st.sampled_from([0.0, 1e-9, 1e-3, 0.1, 1.0, 1e3]))

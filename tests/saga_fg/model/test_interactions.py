@@ -15,7 +15,7 @@ from saga_fg.conformance.programs import BUS, CAR, CONE, MOVING, POLE, TRAM, nod
 from saga_fg.model import nonlinear_interactions
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import Following
-from saga_fg.model.graph_building import build_graph
+from saga_fg.model.graph_building import build_graph, require_stable
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity, applies
 from saga_fg.model.map_rules import DriverStopping, RedLight
 from saga_fg.model.nonlinear_interactions import (
@@ -27,7 +27,6 @@ from saga_fg.model.nonlinear_interactions import (
     SocialForce,
     smooth_acceleration,
 )
-from saga_fg.model.stability import require_stable
 from saga_fg.numerics.geometry import yaw_transform
 from tests.saga_fg.road_scenes import queue, table
 from tests.saga_fg.sampled_traffic import Interaction

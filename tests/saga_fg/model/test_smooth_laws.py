@@ -26,11 +26,10 @@ from saga_fg import InputError
 from saga_fg.learning import TEMPLATE
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import Following, Neighbours
-from saga_fg.model.graph_building import build_graph
+from saga_fg.model.graph_building import LearnedInteractions, build_graph, highest_rate, require_stable
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity, velocity_triples
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.nonlinear_interactions import FALLOFF, RADII, STRENGTH, SmoothDriver, SocialForce
-from saga_fg.model.stability import LearnedInteractions, highest_rate, require_stable
 from saga_fg.tracking import TrackerSettings
 
 DISTANCES = np.array([0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-3, 0.1, 0.3, 1.0, 5.0])  # m

@@ -5,7 +5,7 @@ import pytest
 
 from saga_fg import Tracker, TrackerSettings, track
 from saga_fg.tables.plausibility import seems_dense_traffic
-from saga_fg.tracking.dense_traffic import dense_traffic_settings
+from saga_fg.tracking.table_tracking import dense_traffic_settings
 from tests.saga_fg.traffic_frames import frame, run
 
 TIMES = np.arange(0.0, 2.0, 0.1)

@@ -19,8 +19,7 @@ from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import AssociationSettings, ClassSettings, Journal
-from saga_fg.tracking.edge_record import ACCELERATION, MAX_RATIO, EdgeRecord
-from saga_fg.tracking.halting_places import HaltingPlaces
+from saga_fg.tracking.edge_record import ACCELERATION, MAX_RATIO, EdgeRecord, HaltingPlaces
 from saga_fg.tracking.journal import GraphRecord, TrackerView
 from tests.saga_fg.sampled_traffic import providers, sample_traffic
 from tests.saga_fg.traffic_frames import columns, seen

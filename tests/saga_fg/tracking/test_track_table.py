@@ -13,7 +13,7 @@ from saga_fg.model.sensor import FieldOfView, NoiseModel
 from saga_fg.numerics.arrays import Columns
 from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings, unresolved
-from saga_fg.tracking.reporting import LASTING_SHARE, reported_score
+from saga_fg.tracking.track_life import LASTING_SHARE, reported_score
 from saga_fg.tracking.track_table import PRIOR_LOGIT, SensorEvidence, TrackTable
 from saga_fg.tracking.tracker_state import LIFETIME
 from saga_fg.tracking.update import existences
