@@ -1,7 +1,8 @@
-"""Robust losses: weights of factors that fall with their residuals.
+"""Nonlinear factors: residual functions with full noise models, optionally robust, many of one shape together.
 
-With s = || r ||_R the distance of the residual in standard deviations, a factor costs rho(s) instead of s^2 / 2.
-Solvers reach its minimum by iteratively reweighted least squares: each linearisation is weighted by w(s) = rho'(s) / s.
+Robust losses are weights of factors that fall with their residuals. With s = || r ||_R the distance of the residual in
+standard deviations, a factor costs rho(s) instead of s^2 / 2. Solvers reach its minimum by iteratively reweighted least
+squares: each linearisation is weighted by w(s) = rho'(s) / s.
 
 | loss | rho(s) | w(s) |
 |---|---|---|
@@ -21,7 +22,7 @@ c = 1.345 (huber), 2.385 (cauchy), 4.685 (tukey).
 Source: E. Olson and P. Agarwal, "Inference on networks of mixtures for robust robot mapping", International Journal of
 Robotics Research 32 (2013), here with the sum of the components.
 
-Nonlinear factors: residual functions with full noise models, optionally robust, many of one shape together.
+Factors are
 
     phi_i(x) = exp( -rho( || r_i(x_i1, ..., x_in) ||_{R_i} ) ),      i = 1..N,    rho(s) = s^2 / 2 unless robust
 

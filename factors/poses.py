@@ -1,6 +1,6 @@
 """Relative poses: between two poses, and odometry with the slow errors of its device as states.
 
-Poses and what is measured between two of them: odometry, scan registration, loop closures.
+Odometry, scan registration, loop closures:
 
     r = log( measured^-1 first^-1 second ),    measured = first_T_second + noise in the tangent of the second pose
 

@@ -38,7 +38,7 @@ from data_tools.trajectories import read_kitti_poses, read_tum_poses
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import FloatArray, inverse_transform, quaternion_rotation
 from saga_fg.parts import find
-from saga_fg.providers.odometry import mounting
+from saga_fg.providers.vehicle_sensors import mounting
 from saga_fg.tables import seconds_of_dates
 
 GROUP = "saga_fg.scans"

@@ -21,7 +21,7 @@ from pipelines.slam.results import write_lidar_slam, write_localised
 from pipelines.slam.submaps import Origin, SlamMap, read_map
 from saga_fg.errors import InputError
 from saga_fg.numerics import yaw_transform
-from saga_fg.providers.odometry import mounting
+from saga_fg.providers.vehicle_sensors import mounting
 
 
 @dataclass(frozen=True)

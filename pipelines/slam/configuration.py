@@ -23,7 +23,7 @@ from saga_fg.graph import FactorProvider
 from saga_fg.model import LandmarkDetector
 from saga_fg.numerics import FloatArray
 from saga_fg.parts import new_part
-from saga_fg.providers.odometry import mounting
+from saga_fg.providers.vehicle_sensors import mounting
 from saga_fg.settings import setting, settings_group
 from saga_fg.slam.sensors import SensorName, SensorSettings
 

@@ -1,4 +1,6 @@
-r"""Measurements of some nodes at one time, in a form that an estimator can linearise, and linearise again.
+r"""Prediction and correction of a joint state by components, by the kernels of `saga_fg.kernels.filtering`.
+
+Measurements of some nodes at one time have a form that an estimator can linearise, and linearise again:
 
     z = h(x_node) + v,   v ~ N(0, R)        h(x) = H x for `Measurements`, any measurement model for `Observations`
 
@@ -8,7 +10,7 @@ Around x0, with J = dh/dx,
 
 is what a linear estimator takes in. Angles among z are wrapped.
 
-Prediction and correction of a joint state by components, by the kernels of `saga_fg.kernels.filtering`.
+Predictions and corrections:
 
     predict   m <- F m + b              P <- F P F^T + Q                    F block-sparse, Q block-diagonal
     correct   S = H P H^T + R = L L^T   W = L^-1 H P    m <- m + W^T L^-1 (z - H m)    P <- P - W^T W
@@ -18,7 +20,7 @@ measurements. Where a measurement is so much better than what was known (a milli
 cancels, one refinement with K = W^T L^-1 restores what must hold, H P = R K^T, so that the measured rows are as exact
 as in Joseph's form.
 
-Bounds on the components of a joint state, for speed: which correlations a prediction leaves out.
+Components have bounds, for speed: a prediction leaves out some correlations.
 
     x_i' = sum_{j with i} F_ij x_j + sum_{j not with i} F_ij x_j + b_i + q_i        i and j are "with" in one component
 

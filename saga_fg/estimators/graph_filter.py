@@ -6,7 +6,7 @@
 
 Each component of the graph is solved by what it needs. Objects that nothing ties to others are eliminated all at once,
 in closed form (`saga_fg.estimators.graph_window`). Objects that interactions tie, and those with a nonlinear factor, a
-robust one or one of a user's provider, are variables of `gtsam.ISAM2` (`saga_fg.estimators.incremental_smoother`), and
+robust one or one of a user's provider, are variables of `gtsam.ISAM2` (`saga_fg.estimators.solvers`), and
 what is reported of them is read from its tree. An object passes from the one to the other when a first factor ties it,
 and back when no correlation with others is left.
 """
@@ -37,7 +37,6 @@ from saga_fg.estimators.graph_window import (
     uncoupled,
     whole_graph,
 )
-from saga_fg.estimators.incremental_smoother import IncrementalSmoother
 from saga_fg.estimators.interval_dynamics import (
     IntervalDynamics,
     by_covariance,
@@ -49,6 +48,7 @@ from saga_fg.estimators.interval_dynamics import (
 from saga_fg.estimators.object_factors import DetectionFactors, Interactions
 from saga_fg.estimators.partition import BlockGaussian, StateLayout, checked_prior, not_smaller
 from saga_fg.estimators.smoother import SmoothedState
+from saga_fg.estimators.solvers import IncrementalSmoother
 from saga_fg.graph import MAP_NODE, OBJECT, WIDE, FactorProvider, SceneFactorGraph, node_key, predictors
 from saga_fg.model import Transition
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, checked, shallow_copy

@@ -1,6 +1,6 @@
-"""Objects that nothing ties to others: in one batch, in closed form, and as providers see them.
+"""The window of a running graph: its epochs with what came at each, and the graph of all objects over it.
 
-Over the epochs of a window,
+Objects that nothing ties to others are one batch, in closed form. Over the epochs of a window,
 
     x_i' = F_ii x_i + b_i + q_i,    z = H x_i + v        P = blockdiag( P_1, ..., P_n )
 
@@ -8,8 +8,6 @@ where those whose correlation has not faded yet are one block together. Eliminat
 order of time is the Kalman filter, whose kernels do it here for all at once (`saga_fg.estimators.filtering`). What
 would be their factors are arrays; those of an object that is tied to others, or that somebody looks at, are made then,
 over all of its epochs in the window.
-
-The window of a running graph: its epochs with what came at each, and the graph of all objects over it.
 
 A measurement of the past takes the filter back to the epoch before it: the interval that contains its time is
 discretised anew over both parts, with the edges as they were recorded, and all that came since comes again. That is
@@ -28,12 +26,12 @@ from numpy.typing import ArrayLike
 
 from factors import GaussianFactors, Vector, gaussian_factors
 from saga_fg.errors import InputError
-from saga_fg.estimators.batch import linear_solution
 from saga_fg.estimators.filtering import Dynamics, Measurements, corrected, noise_ratio, predict
 from saga_fg.estimators.interval_dynamics import LARGEST_RATIO, merged
 from saga_fg.estimators.object_factors import component_priors, measurement_factors
 from saga_fg.estimators.partition import UNCORRELATED, BlockGaussian, Partition, StateLayout
 from saga_fg.estimators.smoother import SmoothedState
+from saga_fg.estimators.solvers import linear_solution
 from saga_fg.graph import GraphVariable, NewVariable, SceneFactorGraph, VariableKind, node_key, node_kind
 from saga_fg.model import Transition
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, checked

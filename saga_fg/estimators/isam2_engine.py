@@ -1,6 +1,6 @@
 """iSAM2 as the solver of a running graph: which of its factors are which rows of the graph's groups.
 
-`saga_fg.estimators.incremental_smoother` has the method. Factors on a variable are linearised anew when it has moved by
+`saga_fg.estimators.solvers` has the method. Factors on a variable are linearised anew when it has moved by
 
     || R (delta - delta_0) ||  >  threshold,      R^T R = P^-1
 

@@ -402,7 +402,7 @@ def course_inputs(
     correlation: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Lateral noise (n,) and accelerations that are taken away (n, 2), of states `mean` (n, 6), see
-    `saga_fg.model.turning`."""
+    `saga_fg.model.manoeuvres`."""
     n = len(heading)
     noise, brake = np.empty(n), np.zeros((n, 2))
     for k in range(n):

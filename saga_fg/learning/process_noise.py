@@ -15,7 +15,7 @@ and the time constants of `Curvilinear`, and theta_0 those of the start. The pri
 `INDEPENDENT` objects and no more: those of one place do alike, and differ from those of another. l is Student's t of
 covariance S, so that single wrong detections count little, and with many degrees of freedom, so that covariances cover
 rare turns. The gaps are what the time constants show in: the next detection hardly depends on them. The motion is that
-of the tracker (`saga_fg.model.turning`, `saga_fg.tracking.track_filters`), and all objects are filtered side by side.
+of the tracker (`saga_fg.model.manoeuvres`, `saga_fg.tracking.track_filters`), and objects are filtered side by side.
 """
 
 from __future__ import annotations

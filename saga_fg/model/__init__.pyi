@@ -14,8 +14,17 @@ from .interactions import (
     unit,
 )
 from .landmarks import LandmarkDetector, PlaneLandmark, PointLandmark, PoleLandmark
+from .manoeuvres import (
+    CoordinatedTurn,
+    KnownCourses,
+    Mixture,
+    ModeTable,
+    Stationary,
+    Unseen,
+    mode_dynamics,
+    turning_time,
+)
 from .map_rules import ConeLine, GreenLight, InLane, RedLight, Stopping, coming_vehicles, halting
-from .modes import Mixture, ModeTable, Stationary, mode_dynamics
 from .motion import ConstantAcceleration, ConstantVelocity, Curvilinear, Motion, NodeType, NonlinearMotion, RandomWalk
 from .nonlinear_interactions import AccelerationLaw, IntelligentDriver, SmoothDriver, SocialForce, held
 from .scene_graph import SceneGraph
@@ -30,7 +39,6 @@ from .sensor import (
     checked_sensors,
     sensor_model,
 )
-from .turning import CoordinatedTurn, KnownCourses, Unseen, turning_time
 
 __all__ = [
     "MAX_MEASURED_SPEED",

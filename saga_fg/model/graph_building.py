@@ -1,11 +1,9 @@
-"""The scene graph made by edge rules, and what each of its edges does to a prediction.
+"""The scene graph made by edge rules, what each of its edges does to a prediction, and stability of rules.
 
     effect of e on its target i = x_i(t + dt; all edges) - x_i(t + dt; all edges but e)
 
 in position and velocity, from the estimates at the start of the interval (other components, such as an acceleration,
 are taken as 0: edges act on them by nothing). As F has the sparsity of the graph, only the edges into i matter for i.
-
-Stability of edge rules, alone and together, and interactions learned from recordings.
 
 Edge rules must not drive objects apart.
 
@@ -22,9 +20,8 @@ for velocities may feed each other while headings are held; but in the next inte
 Rules by which lanes, lines or cones act on vehicles are not tried, as their sources are stationary. Nor are laws of
 acceleration, which are bounded in themselves.
 
-Interactions learned from recordings, as a value that is written to a file and given to a tracker.
-
-Learned dynamics must be stable: construction checks them.
+Interactions learned from recordings are a value that is written to a file and given to a tracker. They must be stable:
+construction checks them.
 """
 
 from collections.abc import Callable, Mapping, Sequence

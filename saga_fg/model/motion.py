@@ -2,8 +2,8 @@
 
     dx/dt = A x + w,    E[w(t) w(s)^T] = Qc delta(t - s)
 
-A nonlinear motion has a `flow` besides, its state dt seconds later without noise and interactions (see
-`saga_fg.model.turning`); A is then what of it is linear everywhere, along which noise and interactions are discretised.
+A nonlinear motion (`saga_fg.model.manoeuvres`) has a `flow` besides, its state dt seconds later without noise and
+interactions; A is then what of it is linear everywhere, along which noise and interactions are discretised.
 
 A type names its state components ("x", "vx", ...), so that sensors and interactions find what they need by name and
 nodes of different types, with states of different size, live in one graph.
@@ -110,7 +110,7 @@ class Curvilinear(Settings):
 
     The acceleration along the heading fades (Singer 1970), that across it is that of the turn. White noise
     acceleration, which differs along and across the heading, acts besides. The heading and the turn rate are known
-    inputs of an interval (`saga_fg.model.turning`); where they are missing the motion is straight and its noise
+    inputs of an interval (`saga_fg.model.manoeuvres`); where they are missing the motion is straight and its noise
     the same in all directions. Source of the split: Best and Norton, A new model and efficient tracker for a target
     with curvilinear motion, IEEE Transactions on Aerospace and Electronic Systems 33(3), 1997.
     """

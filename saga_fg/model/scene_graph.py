@@ -62,7 +62,7 @@ class OwnMotions(NamedTuple):
 
 
 class RecordedMotions(Protocol):
-    """Known courses (`saga_fg.model.turning`) or mixtures of motion (`saga_fg.model.modes`) of some nodes."""
+    """Known courses (`saga_fg.model.manoeuvres`) or mixtures of motion (`saga_fg.model.manoeuvres`) of some nodes."""
 
     @property
     def ids(self) -> IntArray: ...

@@ -6,9 +6,8 @@ Each reads what a frame brings (`Frame.ego`) and works in the running graph wher
     providers: [{kind: "saga_fg.providers:Odometry"}, {kind: "saga_fg.providers:Gps", deviation: 0.5}]
 """
 
-from saga_fg.providers.navigation import Gps, Imu
-from saga_fg.providers.odometry import Odometry, StartSettings, Wheels
 from saga_fg.providers.surroundings import Landmarks, LaneKeeping, RelativeDetections
+from saga_fg.providers.vehicle_sensors import Gps, Imu, Odometry, StartSettings, Wheels
 
 __all__ = [
     "Gps",

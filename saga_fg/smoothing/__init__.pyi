@@ -23,7 +23,7 @@ from .boxes import (
 )
 from .doubt import Review
 from .labelling import RecordingLabels
-from .recording import ChunkSettings, LabelBuilder, LabelModel
+from .recording import ChunkSettings, LabelBuilder, LabelModel, smooth
 from .settings import (
     OfflineClass,
     SmoothingSettings,
@@ -40,7 +40,6 @@ from .states import (
     lifespans_of,
     quality_of,
 )
-from .table_smoothing import smooth
 
 __all__ = [
     "ChunkSettings",

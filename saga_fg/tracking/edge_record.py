@@ -1,15 +1,13 @@
-"""Places where vehicles halt with nobody before them: stop lines, learned from traffic.
+"""Edges that answer for themselves: with what probability a rule governs an object, by what came of its predictions.
 
-A vehicle halts at a place if it stands there for `STANDING` s while it is detected, has moved before, and no vehicle is
-on its way within `FREE` m. Places of halts in one lane and direction are one, a line across the lane. It has counts of
-the vehicles that halted at it before they crossed, h, and of those that crossed without, c; the next one halts there
-with the probability
+Stop lines are learned from traffic, as places where vehicles halt with nobody before them. A vehicle halts at a place
+if it stands there for `STANDING` s while it is detected, has moved before, and no vehicle is on its way within `FREE`
+m. Places of halts in one lane and direction are one, a line across the lane. It has counts of the vehicles that halted
+at it before they crossed, h, and of those that crossed without, c; the next one halts there with the probability
 
     p = h / ( h + c + 1 )
 
 Who halts at a line no longer follows a leader that has crossed it: a vehicle that has not is on its own.
-
-Edges that answer for themselves: with what probability a rule governs an object, by what came of its predictions.
 
 While an object and those that act on it are detected, edges make predictions that can be checked. Every `HORIZON` s the
 velocity u of an object is taken from its places now and then, as the estimate has been pulled by the edge already. Over
@@ -29,8 +27,8 @@ probability that the edge governs,
 
     p = 1 / ( 1 + exp( -( l_0 + l_pair + l_place + l_rule ) ) ),    l_0 = log( prior / (1 - prior) )
 
-scales its rate, and so does 1 - the probability that the object halts at a line that a faster source has crossed
-(`saga_fg.tracking.edge_record`). Rules that read the map are taken at their word.
+scales its rate, and so does 1 - the probability that the object halts at a line that a faster source has crossed.
+Rules that read the map are taken at their word.
 """
 
 from __future__ import annotations

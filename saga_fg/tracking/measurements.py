@@ -17,9 +17,8 @@ node is then tied. By the edge rules drivers behind it follow it, also while the
 A detection seen from an estimated pose (R, t) measures r = R^T (p - t) - z of the pose and the object's position p. The
 errors of both depend on earlier detections, so that a detection is compared with the covariance of r, not of p.
 
-The noise of a sensor of which nothing is known, told by its own successive detections, without ground truth.
-
-A divided difference of order k of an object's k + 1 detections z_j at times t_j, `STEP` apart, is free of all motion
+The noise of a sensor of which nothing is known is told by its own successive detections, without ground truth. A
+divided difference of order k of an object's k + 1 detections z_j at times t_j, `STEP` apart, is free of all motion
 along a polynomial of degree k - 1 in time. What is left is noise, of a known share of the variance of a detection:
 
     D_k = sum over j of c_j z_j,   c_j = product over i /= j of 1 / (t_j - t_i),   cov D_k = R sum over j of c_j^2

@@ -1,12 +1,12 @@
-"""Dense road traffic, seen by a sensor that stands or hovers: its settings.
+"""Tracking of a whole table of detections in one call, which refuses one whose contents contradict how it is read.
 
-Drones and roadside sensors give vehicles with headings, many at a time and often. There a vehicle keeps to its course,
-to the trails of those before it, and does what its leader does (`saga_fg.tracking.traffic`). The motion of vehicles was
-chosen on half of the windows of two recorded roads, and confirmed on the others.
+`dense_traffic_settings` are those for a sensor that stands or hovers over a road. Drones and roadside sensors give
+vehicles with headings, many at a time and often. There a vehicle keeps to its course, to the trails of those before it,
+and does what its leader does (`saga_fg.tracking.traffic`). The motion of vehicles was chosen on half of the windows of
+two recorded roads, and confirmed on the others.
 
-Tracking of a whole table of detections in one call, which refuses one whose contents contradict how it is read.
-
-A tracker in the place of those that number detections: `update(detections)`, as of supervision and `trackers`.
+`IdentityTracker` takes the place of trackers that number detections: `update(detections)`, as of supervision and
+`trackers`.
 """
 
 import copy

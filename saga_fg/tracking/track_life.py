@@ -1,5 +1,6 @@
-"""Unresolved tracks: new ones over a live track of their class, of whose object they may be a second detection.
+"""Tracks from their first detection to their last: which begin, which are tentative, are told to the user, and end.
 
+Unresolved tracks are new ones over a live track of their class, of whose object they may be a second detection.
 Detectors report one object as two or three boxes, above all in crowds and rows of parked ones. Two objects of a class
 hardly ever overlap: of labelled cars on nuScenes 0.1 % have a bird's-eye IoU above 0.02 with another one, of
 pedestrians 5 % one above 0.05 and 0.1 % one above 0.2. A new track that overlaps a surer one by more than `OVERLAP` is
@@ -23,9 +24,7 @@ Initiate: detections that belong to no track, and are probable enough, begin new
 
 A new track begins with its measurement and the prior of its class: where no velocity was measured, with that of the
 traffic around it (`saga_fg.tracking.traffic`). Returns of lost objects are left out before
-(`saga_fg.tracking.relinking`); a new track over another one is tentative (`saga_fg.tracking.track_life`).
-
-Report and delete: which tracks are told to the user, and which end.
+(`saga_fg.tracking.relinking`); a new track over another one is tentative.
 
 Report: the tracks of sufficient existence that are detected, or that are in a field of view at a place that is known
 well enough.

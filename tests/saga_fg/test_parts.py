@@ -35,9 +35,8 @@ from saga_fg.conformance import (
 from saga_fg.errors import InputError
 from saga_fg.model.edge_rules import Following, Neighbours, Repulsion
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
-from saga_fg.model.modes import Mixture
+from saga_fg.model.manoeuvres import CoordinatedTurn, Mixture
 from saga_fg.model.nonlinear_interactions import SmoothDriver
-from saga_fg.model.turning import CoordinatedTurn
 from saga_fg.parts import offered
 from saga_fg.tracking import AssociationSettings, ClassSettings
 from tests.saga_fg.traffic_frames import columns

@@ -34,7 +34,7 @@ from saga_fg.graph import SceneFactorGraph
 from saga_fg.graph.variables import node_key
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
-from saga_fg.model.turning import KnownCourses
+from saga_fg.model.manoeuvres import KnownCourses
 from tests.saga_fg.estimator_scenario import Textbook, admissible, assert_smoothed, random_scenario, tell
 from tests.saga_fg.every_estimator import ESTIMATORS, maker
 from tests.saga_fg.graph_keys import newest_key

@@ -45,9 +45,8 @@ from saga_fg.learning.sensor_fit import fit_field_of_view
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import Following, Neighbours, Repulsion
 from saga_fg.model.interactions import SharedVelocity
-from saga_fg.model.modes import Mixture
+from saga_fg.model.manoeuvres import KnownCourses, Mixture
 from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel, ScoreCalibration
-from saga_fg.model.turning import KnownCourses
 from saga_fg.tracking import ClassSettings, Tracker, TrackerSettings
 from tests.saga_fg.following_pairs import GAP, following_pairs, scene_of
 

@@ -10,8 +10,7 @@ from saga_fg.conformance.programs import TextbookEstimator
 from saga_fg.estimators import GraphFilter, JointKalmanFilter, Measurements
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import SharedVelocity
-from saga_fg.model.modes import Mixture, ModeTable, Stationary, mode_dynamics
-from saga_fg.model.turning import CoordinatedTurn
+from saga_fg.model.manoeuvres import CoordinatedTurn, Mixture, ModeTable, Stationary, mode_dynamics
 from tests.saga_fg.model.test_motion import BACK_ENDS
 
 LINEAR = Mixture((Stationary(), ConstantVelocity(2.0)), dwell_time=3.0)

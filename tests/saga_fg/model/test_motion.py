@@ -21,9 +21,9 @@ from saga_fg.estimators import GraphFilter, JointKalmanFilter, Measurements
 from saga_fg.estimators.interval_dynamics import nonlinear_dynamics
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.interactions import SharedVelocity
+from saga_fg.model.manoeuvres import CoordinatedTurn
 from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce
 from saga_fg.model.scene_graph import NonlinearEdges
-from saga_fg.model.turning import CoordinatedTurn
 from tests.saga_fg.graph_keys import keys_of
 
 

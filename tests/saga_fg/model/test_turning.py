@@ -13,8 +13,8 @@ from saga_fg import ConstantAcceleration, ConstantVelocity, Curvilinear, NodeTyp
 from saga_fg.conformance.programs import node_table
 from saga_fg.model.discretisation import discretise, linear_motions
 from saga_fg.model.interactions import SharedVelocity
+from saga_fg.model.manoeuvres import RATE_CORRELATION, CoordinatedTurn, KnownCourses, Unseen, turning_time
 from saga_fg.model.scene_graph import Edges
-from saga_fg.model.turning import RATE_CORRELATION, CoordinatedTurn, KnownCourses, Unseen, turning_time
 
 TURN = CoordinatedTurn()
 SMALL = (0.0, 0.0099, 0.0101, -2.0)

@@ -20,7 +20,7 @@ from saga_fg.graph import (
 from saga_fg.model.landmarks import PointLandmark
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.providers import Gps, Imu, Landmarks, LaneKeeping, Odometry, StartSettings
-from saga_fg.providers.navigation import GRAVITY
+from saga_fg.providers.vehicle_sensors import GRAVITY
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.frame import EgoMeasurements, GpsFix, ImuSamples, Observation, OdometryIncrement
 from saga_fg.types.road_map import Lane

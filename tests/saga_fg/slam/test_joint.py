@@ -11,8 +11,8 @@ from factors import prior_factor
 from saga_fg import Boxes, Detections, Frame, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.graph import EGO_VELOCITY, Additions, GraphView, NewVariable
 from saga_fg.model.landmarks import PoleLandmark
+from saga_fg.model.manoeuvres import CoordinatedTurn
 from saga_fg.model.sensor import NoiseModel
-from saga_fg.model.turning import CoordinatedTurn
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.slam.joint import (
     JointSettings,

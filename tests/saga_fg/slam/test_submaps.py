@@ -10,11 +10,11 @@ import pytest
 
 from factors import SolverSettings, pose_prior_factor
 from saga_fg.errors import InputError
-from saga_fg.estimators.batch import BatchSolver
+from saga_fg.estimators.solvers import BatchSolver
 from saga_fg.graph import EGO_POSE, Additions, GraphView
 from saga_fg.model.landmarks import PlaneLandmark, PoleLandmark
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
-from saga_fg.providers.navigation import Gps
+from saga_fg.providers.vehicle_sensors import Gps
 from saga_fg.slam.mapping import pose_key
 from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph, SubmapSettings
 from saga_fg.types.frame import Detections, EgoMeasurements, Frame, GpsFix, Observation

@@ -14,7 +14,7 @@ from pipelines.tracking import track_scene
 from saga_fg import ConstantAcceleration, ConstantVelocity, RandomWalk, Tracker, TrackerSettings
 from saga_fg.kernels.tracks import association_marginals
 from saga_fg.model.edge_rules import Neighbours
-from saga_fg.model.modes import Mixture
+from saga_fg.model.manoeuvres import Mixture
 from saga_fg.model.sensor import NoiseModel, Sensor
 from saga_fg.numerics.assignment import Matching
 from saga_fg.numerics.geometry import yaw_transform

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from saga_fg import Curvilinear, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings, courses
-from saga_fg.tracking.courses import typical_speed
+from saga_fg.tracking.prediction import typical_speed
 from saga_fg.tracking.traffic import STEP, Passages, Traffic, TrafficSettings, paths
 from saga_fg.types.road_map import Lane, RoadMap
 from tests.saga_fg.traffic_frames import assert_same, frame

@@ -13,7 +13,7 @@ from saga_fg.estimators import BatchSolver, IncrementalSmoother
 from saga_fg.graph import EGO_BIAS, EGO_POSE
 from saga_fg.numerics.geometry import inverse_transform, yaw_transform
 from saga_fg.providers import Gps, Imu, StartSettings, Wheels
-from saga_fg.providers.odometry import mounting
+from saga_fg.providers.vehicle_sensors import mounting
 from saga_fg.slam.mapping.mapper import MeasuredMotion
 from saga_fg.slam.sensors import SensorBuffer, SensorConsistency, SensorSettings, sensor_providers
 

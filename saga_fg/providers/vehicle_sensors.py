@@ -1,4 +1,17 @@
-"""Providers of the vehicle's navigation sensors: satellites and inertial measurements.
+"""Providers of the vehicle's own sensors: first pose, odometry, wheels, satellites, and inertial measurements.
+
+The vehicle's pose from epoch to epoch, by odometry.
+
+    r = log( measured^-1 before^-1 now ),    measured = before_T_now of the interval
+
+An increment over other times than the epoch's is taken for a steady motion, of which the epoch has its share: the
+motion's logarithm times the share, its covariance as well. Without an increment the vehicle may be anywhere nearby.
+
+The speed of the vehicle by its wheels: they roll ahead, and slide neither sideways nor off the ground.
+
+    r = log( X^-1 before^-1 now X )_translation / dt - (v, 0, 0)
+
+X is the place of the axle that does not steer, v the mean speed by the wheels.
 
 The vehicle's place by satellites: r = t + R a - z, with a the antenna's place on the vehicle.
 
@@ -19,20 +32,222 @@ The sensor may sit anywhere on the vehicle (`mounted`).
 
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
 
-from factors import PlanarPose, Robust, SpatialPose, prior_factor, residual_factor
+from factors import (
+    PlanarPose,
+    Pose,
+    Robust,
+    SpatialPose,
+    between_factor,
+    pose,
+    pose_prior_factor,
+    prior_factor,
+    residual_factor,
+)
 from saga_fg.errors import InputError
 from saga_fg.graph import EGO_BIAS, EGO_POSE, EGO_VELOCITY, Additions, GraphView, NewVariable
-from saga_fg.numerics import FloatArray, chi_square_quantile
-from saga_fg.providers.odometry import NO_POSE, ON_THE_POSE, Mounting, StartSettings, mounting
+from saga_fg.numerics import FloatArray, chi_square_quantile, yaw_of, yaw_transform
 from saga_fg.settings import Fraction, Positive, PositiveOrInf, Settings, setting, settings_group
-from saga_fg.types import ImuSamples
+from saga_fg.types import Frame, ImuSamples, OdometryIncrement
+
+NO_POSE = "expected a provider that adds the vehicle's pose before it, such as saga_fg.providers:Odometry"
+
+
+@dataclass(frozen=True)
+class StartSettings(Settings):
+    """The vehicle's first pose."""
+
+    place: tuple[float, float, float] | None = setting(
+        None, "x, y (m) and yaw (rad) in the world; null: world_T_ego of the first frame, else its GPS fix and yaw 0"
+    )
+    deviation: Positive = setting(1.0, "standard deviation of the position, m")
+    heading_deviation: Positive = setting(0.1, "standard deviation of the heading, rad")
+    tilt_deviation: Positive = setting(0.02, "standard deviation of roll and pitch of poses in space, rad")
+    planar: bool = setting(True, "true: poses (x, y, heading), gtsam.Pose2; false: poses in space, gtsam.Pose3")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.place is not None and not all(map(math.isfinite, self.place)):
+            raise InputError(f"place: expected finite numbers, got {self.place!r}")
+
+    def additions(self, view: GraphView) -> Additions:
+        """The first pose with its prior; none where the vehicle has a pose already."""
+        if view.now(EGO_POSE) or view.before(EGO_POSE):
+            return Additions()
+        world_T_ego = self.transform(view.frame)
+        world_T_ego[:2, 3] -= view.origin
+        if self.planar:
+            start: Pose = gtsam.Pose2(float(yaw_of(world_T_ego[:3, :3])), world_T_ego[:2, 3])
+            sigmas = [self.deviation, self.deviation, self.heading_deviation]
+        else:
+            start = pose("start", world_T_ego)
+            sigmas = [self.tilt_deviation, self.tilt_deviation, self.heading_deviation] + 3 * [self.deviation]
+        prior = pose_prior_factor(view.key(EGO_POSE, 0), start.matrix(), np.diag(np.square(sigmas)))
+        return Additions([NewVariable(EGO_POSE, 0, start, label="vehicle")], [prior])
+
+    def transform(self, frame: Frame | None) -> FloatArray:
+        """world_T_ego (4, 4) as settings or a frame have it."""
+        if self.place is not None:
+            x, y, yaw = self.place
+            return yaw_transform(x, y, 0.0, yaw)
+        if frame is not None and frame.world_T_ego is not None:
+            return frame.world_T_ego.copy()
+        start = np.eye(4)
+        if frame is not None and frame.ego is not None and frame.ego.gps is not None:
+            place = frame.ego.gps.position
+            start[: len(place), 3] = place
+        return start
+
+
+_SAME = 1e-4  # relative difference of two intervals that timestamps make
+UNKNOWN_SPEED = 10.0  # standard deviation of the velocity where there is no increment, m/s
+UNKNOWN_TURN = 0.3  # standard deviation of the turn rate where there is no increment, rad/s
+
+
+@dataclass(frozen=True)
+class Odometry(Settings):
+    """Adds the vehicle's pose at every epoch, and the increments of odometry (`frame.ego.odometry`)."""
+
+    start: StartSettings = settings_group(StartSettings, "first pose")
+    place_drift: Positive = setting(
+        0.1, "standard deviation of the position after one second, for increments without a covariance, m"
+    )
+    heading_drift: Positive = setting(
+        0.01, "standard deviation of heading, roll and pitch after one second, likewise, rad"
+    )
+    name = "odometry"
+
+    def predict(self, view: GraphView) -> Additions:
+        before = view.before(EGO_POSE)
+        if not before:
+            return self.start.additions(view)
+        last, key = before[0].key, view.key(EGO_POSE, 0)
+        planar = isinstance(view.state(last), gtsam.Pose2)
+        motion, covariance = self._motion(view, planar)
+        new = (
+            [] if view.now(EGO_POSE) else [NewVariable(EGO_POSE, 0, view.state(last).compose(motion), label="vehicle")]
+        )
+        return Additions(new, [between_factor(last, key, motion.matrix(), covariance)])
+
+    def factors(self, view: GraphView) -> Additions:
+        return Additions()
+
+    def _motion(self, view: GraphView, planar: bool) -> tuple[Pose, FloatArray]:
+        """Motion of this epoch, with the covariance of its tangent."""
+        ego = None if view.frame is None else view.frame.ego
+        if ego is None or ego.odometry is None:
+            stationary: Pose = gtsam.Pose2() if planar else gtsam.Pose3()
+            return stationary, self._covariance(UNKNOWN_SPEED * view.dt, UNKNOWN_TURN * view.dt, planar)
+        reported = ego.odometry
+        motion = _motion_of(reported, planar)
+        covariance = reported.covariance
+        if covariance is None:
+            covariance = self._covariance(self.place_drift, self.heading_drift, planar) * reported.dt
+        share = view.dt / reported.dt
+        if abs(share - 1) <= _SAME:
+            return motion, covariance
+        still: Any = type(motion)()
+        return still.expmap(share * still.logmap(motion)), share * max(share, 1.0) * covariance
+
+    def _covariance(self, place: float, heading: float, planar: bool) -> FloatArray:
+        sigmas = [place, place, heading] if planar else 3 * [heading] + 3 * [place]
+        return np.diag(np.square(sigmas))
+
+
+def _motion_of(reported: OdometryIncrement, planar: bool) -> Pose:
+    wanted = 3 if planar else 4
+    if len(reported.before_T_now) != wanted:
+        n = len(reported.before_T_now)
+        raise InputError(f"odometry: expected a {wanted} x {wanted} transform, as poses are, got {n} x {n}")
+    return pose("odometry", reported.before_T_now)
+
+
+Mounting = tuple[float, float, float, float, float, float]
+ON_THE_POSE: Mounting = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+Provider = TypeVar("Provider")
+
+
+def mounting(name: str, numbers: Mounting) -> gtsam.Pose3:
+    """pose_T_sensor of x, y, z (m), roll, pitch, yaw (rad). Raises `InputError` for other than six finite numbers."""
+    if len(numbers) != 6 or not all(map(math.isfinite, numbers)):
+        raise InputError(f"{name}: expected six finite numbers x, y, z, roll, pitch, yaw, got {numbers!r}")
+    x, y, z, roll, pitch, yaw = numbers
+    return gtsam.Pose3(gtsam.Rot3.Ypr(yaw, pitch, roll), np.array([x, y, z]))
+
+
+def on_pose(provider: Provider, pose_T_vehicle: FloatArray) -> Provider:
+    """The provider with its sensor, whose settings say where it is on the vehicle, placed on another pose (4, 4).
+
+    For graphs whose pose is not the vehicle's but, say, a LiDAR's. Providers without a sensor stay as they are.
+    """
+    settings: Any = provider
+    placed: Provider = provider
+    onto = gtsam.Pose3(pose_T_vehicle)
+    if hasattr(settings, "antenna"):
+        placed = replace(settings, antenna=tuple(onto.transformFrom(np.array(settings.antenna)).tolist()))
+    if hasattr(settings, "mounted"):
+        at = onto.compose(mounting("mounted", settings.mounted))
+        placed = replace(settings, mounted=(*at.translation().tolist(), *at.rotation().rpy().tolist()))
+    return placed
+
+
+_OFF = 0.5  # share of an epoch that the wheels must have measured
+SIDEWAYS = 0.1  # standard deviation of the velocity to the side and upwards, m/s
+
+
+@dataclass(frozen=True)
+class Wheels(Settings):
+    """Adds the speed by the wheels (`frame.ego.wheels`) between the vehicle's poses in space of two epochs."""
+
+    deviation: Positive = setting(
+        0.1, "standard deviation of a speed without one of its own, m/s; higher: trusted less"
+    )
+    share: Fraction = setting(0.01, "standard deviation of a speed as a share of it: radius of the wheels, slip")
+    outlier_scale: Positive = setting(
+        3.0, "residual from which the Cauchy loss discounts a speed, as of spinning wheels, standard deviations"
+    )
+    mounted: Mounting = setting(
+        ON_THE_POSE, "x, y, z (m), roll, pitch, yaw (rad) of the axle that does not steer, in the vehicle's frame"
+    )
+    name = "wheels"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        mounting("mounted", self.mounted)
+
+    @property
+    def _place(self) -> gtsam.Pose3:
+        return mounting("mounted", self.mounted)
+
+    def factors(self, view: GraphView) -> Additions:
+        wheels = None if view.frame is None or view.frame.ego is None else view.frame.ego.wheels
+        before, now = view.before(EGO_POSE).get(0), view.now(EGO_POSE).get(0)
+        if wheels is None or before is None or view.dt == 0 or wheels.dt < _OFF * view.dt:
+            return Additions()
+        if now is None:
+            raise InputError(NO_POSE)
+        if now.dim != 6:
+            raise InputError("wheels: expected the vehicle's pose in space, got one in the plane")
+        ahead = np.hypot(self.deviation if wheels.deviation is None else wheels.deviation, self.share * wheels.speed)
+        R = np.diag(np.square([ahead, SIDEWAYS, SIDEWAYS]))
+        residual = partial(_residual, self._place, view.dt, wheels.speed)
+        robust = Robust("cauchy", self.outlier_scale)
+        keys, types = [before.key, now.key], [SpatialPose(), SpatialPose()]
+        factor = residual_factor(keys, types, residual, R, robust=robust, name="speed of the wheels")
+        return Additions(factors=[factor])
+
+
+def _residual(place: gtsam.Pose3, dt: float, speed: float, before: Any, now: Any) -> FloatArray:
+    moved = gtsam.Pose3.Logmap(before.compose(place).between(now.compose(place)))[3:] / dt
+    moved[0] -= speed
+    return np.asarray(moved)
+
 
 _LOG = logging.getLogger(__name__)
 GRAVITY = 9.81  # m/s^2, which differs by 0.3 % at most from place to place, less than a bias
@@ -106,7 +321,7 @@ def _moved_back(view: GraphView, key: int, antenna: FloatArray, age: float) -> F
 
 INTEGRATION_NOISE = 1e-4  # noise density of integrating the position, m/s/sqrt(Hz)
 UNKNOWN_ACCELERATION = 3.0  # noise density of the acceleration in gaps of the samples, m/s^2/sqrt(Hz)
-UNKNOWN_TURN = 0.3  # noise density of the turn rate in gaps of the samples, rad/s/sqrt(Hz)
+UNKNOWN_TURN_DENSITY = 0.3  # noise density of the turn rate in gaps of the samples, rad/s/sqrt(Hz)
 _COARSE = 0.1  # s, of samples in gaps: with one for all of it a place would tell the velocity
 
 
@@ -212,7 +427,7 @@ class Imu(Settings):
         noises = (self.accelerometer_noise, self.gyroscope_noise)
         for name, deviation in (
             ("Accelerometer", noises[0] if known else UNKNOWN_ACCELERATION),
-            ("Gyroscope", noises[1] if known else UNKNOWN_TURN),
+            ("Gyroscope", noises[1] if known else UNKNOWN_TURN_DENSITY),
             ("Integration", INTEGRATION_NOISE),
             ("BiasAcc", self.accelerometer_drift),
             ("BiasOmega", self.gyroscope_drift),
