@@ -44,7 +44,7 @@ class PartKind:
         """Raise `InputError` unless a part has all members of one of the roles, or derives from it."""
         lacking = [_lacking(role, part) for role in self.roles]
         if all(lacking):
-            expected = f"expected {_article(self.name)} {min(lacking, key=len)}"
+            expected = f"expected {'an' if self.name[0] in 'aeiou' else 'a'} {self.name} {min(lacking, key=len)}"
             made = f"the class {part.__name__}, make it: {part.__name__}()" if isinstance(part, type) else ""
             raise InputError(f"{where}: {expected}, got {made or type(part).__name__}")
 
@@ -189,7 +189,3 @@ def _lacking(role: type, part: object) -> str:
 def _has(part: object, name: str, method: bool) -> bool:
     found = inspect.getattr_static(part, name, None)
     return found is not None and (not method or callable(getattr(part, name, None)))
-
-
-def _article(name: str) -> str:
-    return f"{'an' if name[0] in 'aeiou' else 'a'} {name}"

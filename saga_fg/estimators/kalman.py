@@ -29,7 +29,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -53,7 +52,6 @@ from saga_fg.estimators.partition import BlockGaussian, StateLayout, checked_pri
 from saga_fg.graph import (
     FactorProvider,
     GraphError,
-    GraphVariable,
     GraphView,
     LinearisationPoint,
     NewVariable,
@@ -88,8 +86,6 @@ class AuxiliaryVariables:
     def rows(self, layout: StateLayout) -> IntArray:
         """Rows of the auxiliary variables in the joint state."""
         known = self.graph.variables
-        if not known:
-            return _NO_ROWS
         return np.array([row for row, node in enumerate(layout.nodes.tolist()) if node in known], dtype=np.int64)
 
     def dynamics(self, transition: Transition, x: BlockGaussian) -> Dynamics:
@@ -150,7 +146,13 @@ def asked(
         raise solver_error(graph.variables, graph.groups, SingularSystemError("", alone))
     if new:
         base = graph.base
-        bare.add_variables("", [_again(one, one.type.read(base, key)) for key, one in new.items()])
+        bare.add_variables(
+            "",
+            [
+                NewVariable(one.kind, one.id, one.type.read(base, key), one.epoch is None, one.label, one.type)
+                for key, one in new.items()
+            ],
+        )
         ids |= {key: key for key in new}
         for key, one in new.items():  # in the place of what the factors will say of it
             x = x.extended(x.layout.extended([key], one.dim), np.zeros((1, one.dim)), np.eye(one.dim)[None])
@@ -213,10 +215,6 @@ def _move(graph: SceneFactorGraph, x: BlockGaussian, ids: Mapping[int, int]) -> 
         values.erase(key)
         insert_state(values, one, one.type.retract(one.type.read(base, key), state) if ids[key] == key else state)
     graph.moved_to(values)
-
-
-def _again(variable: GraphVariable, state: Any) -> NewVariable:
-    return NewVariable(variable.kind, variable.id, state, variable.epoch is None, variable.label, variable.type)
 
 
 def _linear(graph: SceneFactorGraph, ids: Mapping[int, int], new: Collection[int]) -> list[Linear]:

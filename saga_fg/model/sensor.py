@@ -307,8 +307,6 @@ class Sensor(Settings):
 
     def sees(self, position: FloatArray, world_T_ego: FloatArray | None) -> BoolArray:
         """Mask (N,) of positions (N, 2), world, in the field of view; all where the pose is unknown."""
-        if world_T_ego is None:
-            return np.ones(len(position), dtype=bool)
         return self.field_of_view.holds(*self.polar(position, world_T_ego))
 
     def polar(self, position: FloatArray, world_T_ego: FloatArray | None) -> tuple[FloatArray, FloatArray]:

@@ -321,11 +321,8 @@ def near_pairs(
 
     a (n, 2), b (m, 2), reach (n,) and further (m,) in m; where one of these is NaN there is no pair
     """
-    reach, further = np.asarray(reach, dtype=np.float64), np.asarray(further, dtype=np.float64)
-    return _near_pairs(a, b, reach, further if further.ndim else np.full(len(b), further))
-
-
-def _near_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: FloatArray) -> tuple[IntArray, IntArray]:
+    reach = np.asarray(reach, dtype=np.float64)
+    further = np.zeros(len(b)) + further
     if len(a) * len(b) <= MAX_COMPARED:
         return compared_pairs(a, b, reach, further)
     i, j = (~np.isnan(reach)).nonzero()[0], (~np.isnan(further)).nonzero()[0]
@@ -342,16 +339,11 @@ def _near_pairs(a: FloatArray, b: FloatArray, reach: FloatArray, further: FloatA
         radius = float(widest[alike].max()) * (1 + 1e-9)
         near = cKDTree(a[i[alike]]).sparse_distance_matrix(tree, radius, output_type="ndarray")
         row, column = i[alike[near["i"]]], j[near["j"]]
-        within = _square(a[row], b[column]) <= (reach[row] + further[column]) ** 2
+        x, y = (a[row] - b[column])[:, :2].T
+        within = x * x + y * y <= (reach[row] + further[column]) ** 2
         found.append(row[within] * len(b) + column[within])
     row, column = np.divmod(np.sort(np.concatenate(found)), len(b))
     return row, column
-
-
-def _square(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Squared distances (...) of places (..., 2)."""
-    x, y = a[..., 0] - b[..., 0], a[..., 1] - b[..., 1]
-    return np.asarray(x * x + y * y)
 
 
 def chi_square_quantile(probability: float, degrees: float) -> float:

@@ -119,11 +119,6 @@ def label_states(
     return LabelledStates(states, headings, columns, *doubt)
 
 
-def source_counts(source: StrArray) -> dict[str, int]:
-    """Numbers of boxes by what they rest on."""
-    return {kind: int((source == kind).sum()) for kind in get_args(Source)}
-
-
 def dropped_boxes(evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray) -> int:
     """Number of boxes of dropped objects at the times `wanted` (M,), s."""
     at, gone = np.searchsorted(evidence.times, wanted), objects.dropped
@@ -376,8 +371,10 @@ class RecordingLabels:
 
     def counts(self) -> LabelCounts:
         """Where the boxes come from."""
-        sources = [source_counts(columns.source) for _, _, _, columns in self._chunks()]
-        return LabelCounts.sum(LabelCounts(**counts) for counts in sources)
+        return LabelCounts.sum(
+            LabelCounts(**{kind: int((columns.source == kind).sum()) for kind in get_args(Source)})
+            for _, _, _, columns in self._chunks()
+        )
 
     def __iter__(self) -> Iterator[tuple[Labels, ...]]:
         for times, rows, at, columns in self._chunks():

@@ -120,10 +120,7 @@ class RawTable:
             return np.full(self.length, default)
         if name not in self._read:
             self._read[name] = self._in_our_unit(name)
-        numbers = self._read[name]
-        if default == default and not self.present(name).all():
-            return np.where(self.present(name), numbers, default)
-        return numbers.copy()
+        return np.where(self.present(name), self._read[name], default)
 
     def check_numbers(self, names: Sequence[str]) -> None:
         """Raise one `InputError` for all of these columns that hold anything but finite numbers."""

@@ -25,7 +25,7 @@ from .track_table import SensorEvidence, TrackTable
 from .tracker import Tracker
 from .tracker_state import TrackerState
 from .traffic import Passages, SpeedPriorSettings, Traffic, TrafficSettings
-from .visibility import visible_share
+from .update import visible_share
 
 __all__ = [
     "MOVING",

@@ -6,7 +6,7 @@ r"""Associate: match the measurements of a frame to the tracks, within the class
 
 A pair is matched for less than what it costs to leave both alone: with a = b = 1 the difference of the two is
 -2 log of the ratio of likelihoods that the detection is the track's, or that the track was missed and the detection is
-false. p_i = r_i v_i p_D: the track's existence, its visibility (`saga_fg.tracking.visibility`) and the sensor's
+false. p_i = r_i v_i p_D: the track's existence, its visibility (`saga_fg.tracking.update`) and the sensor's
 detection probability. p_j is the detection's probability; a and b below 1 reduce their influence. lambda is the number
 of false detections of the class per m^2 that the frame's own scores suggest, so that it fits any detector. A track of
 low existence, or one that nobody can see, can't take a strong detection from afar, least of all among many weak ones,
@@ -14,7 +14,7 @@ and of two detections the more probable one is preferred.
 
 Candidates are the pairs of one class, or of classes that a sensor confuses, with a cost of their own
 (`saga_fg.tracking.class_belief`), inside its gate. Identities that a sensor gives add theirs
-(`saga_fg.tracking.given_identities`). The assignment is the one of least total cost (`hungarian`), is made
+(`saga_fg.tracking.identities`). The assignment is the one of least total cost (`hungarian`), is made
 cheapest pair first (`greedy`), or registers the observed graph to the predicted graph (`graph`): the costs above
 are then joined by those of `saga_fg.numerics.assignment` between pairs of candidates, of all classes, whose tracks
 have correlated errors.
@@ -25,7 +25,7 @@ goes with these costs, and of a detection the share that is its track's, among t
     share_ij = p_ij / ( p_ij + sum of q_k p_kj over other tracks k )     q_k: r_k v_k of a confirmed track, else 0
 
 It is 1 almost everywhere, and is taken as 1 from `association.clear_above` on. Below that the update is weighted by it
-(`saga_fg.tracking.update`), and the two tracks may have exchanged their objects (`saga_fg.tracking.encounters`).
+(`saga_fg.tracking.update`), and the two tracks may have exchanged their objects (`saga_fg.tracking.identities`).
 
 Costs of a user's own (`AssociationCost`) are added to those of the pairs.
 
@@ -61,7 +61,7 @@ from saga_fg.numerics import (
 )
 from saga_fg.parts import of_own_code
 from saga_fg.tracking.class_belief import NONE_CONFUSED, ConfusedClasses
-from saga_fg.tracking.given_identities import identity_cost
+from saga_fg.tracking.identities import identity_cost
 from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
 from saga_fg.tracking.relinking import relinked
 from saga_fg.tracking.settings import AssociationProblem, AssociationSettings, ClassSettings, TrackerSettings

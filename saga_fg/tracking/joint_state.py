@@ -27,7 +27,7 @@ from saga_fg.graph import EGO_POSE, SceneFactorGraph, key_of
 from saga_fg.model import POSITION, VELOCITY, Mixture, ModeTable, Motion, NodeType, SceneGraph, discretise, own_motion
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray, distinct, shallow_copy, yaw_transform
 from saga_fg.providers import RelativeDetections
-from saga_fg.tracking.given_identities import exchanged
+from saga_fg.tracking.identities import exchanged
 from saga_fg.tracking.track_filters import Kinematics, RelativePositions
 from saga_fg.types import Frame
 

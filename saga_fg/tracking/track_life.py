@@ -35,7 +35,7 @@ Each has a score and a calibrated covariance:
     P_reported  = ( c (1 + h (1 - p)) )^2 P + ( b (1 + k (1 - p)) )^2 u u^T
 
 The score rests on all evidence of the track so far: p is the probability of its latest detection, m that of its best
-one, g the share of it that lasts, r the existence, v the visibility (`saga_fg.tracking.visibility`). It is monotone in
+one, g the share of it that lasts, r the existence, v the visibility (`saga_fg.tracking.update`). It is monotone in
 the evidence: a higher probability of any detection lowers no score of the track, then or later, and neither does one
 more hit. A weak detection leaves the share g, and a gap multiplies the scores of the boxes in it by r v: misses lower r
 where the object should have been seen, and v where it may be hidden.

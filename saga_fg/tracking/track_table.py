@@ -42,7 +42,7 @@ class SensorEvidence(Columns):
     time           (n, S) of it, s, -inf if there was none
     hits           (n, S) frames in which the sensor detected the track
     opportunities  (n, S) frames in which the sensor could have detected it
-    visibility     (n, S) probability that the sensor's latest frame had it in view, see `saga_fg.tracking.visibility`
+    visibility     (n, S) probability that the sensor's latest frame had it in view, see `saga_fg.tracking.update`
     looked         (n, S) time of that frame, s
     sensors        names (S,), of the whole table
     """

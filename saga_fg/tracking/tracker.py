@@ -41,10 +41,10 @@ from saga_fg.tracking.update import (
     exchange_identities,
     follow_encounters,
     infer_signals,
+    look,
     update_existence,
     update_tracks,
 )
-from saga_fg.tracking.visibility import look
 from saga_fg.types import LATEST, Frame, PredictedTracks, Tracks, checked_horizons, finite_seconds
 
 log = logging.getLogger(__name__)
@@ -348,7 +348,5 @@ class Tracker:
     @property
     def max_delay(self) -> float:
         """Age up to which a late frame is used, s."""
-        settings = self.settings
-        if settings.ego is not None and settings.ego.estimated:
-            return 0.0  # the vehicle's earlier poses are not kept
-        return max(settings.max_delay, self._state.joint.window)
+        estimated = self.settings.ego is not None and self.settings.ego.estimated  # earlier poses are not kept
+        return 0.0 if estimated else max(self.settings.max_delay, self._state.joint.window)

@@ -29,8 +29,7 @@ from saga_fg.tracking.class_belief import ConfusedClasses
 from saga_fg.tracking.clock import Clock, TimeVerdict
 from saga_fg.tracking.clock_offsets import SharedObservations
 from saga_fg.tracking.edge_record import EdgeRecord, HaltingPlaces
-from saga_fg.tracking.encounters import Encounters
-from saga_fg.tracking.given_identities import GivenIdentities, exchanged
+from saga_fg.tracking.identities import Encounters, GivenIdentities, exchanged
 from saga_fg.tracking.joint_state import JointTrackState, moved_to_present, past_position
 from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
 from saga_fg.tracking.measurements import EgoNode, SensorNoise

@@ -48,7 +48,7 @@ from saga_fg.kernels.tracks import prior_of_traffic
 from saga_fg.model import Paths
 from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, common_numbers, shallow_copy
 from saga_fg.settings import NonNegative, PositiveOrInf, Settings, setting, settings_group
-from saga_fg.tracking.given_identities import exchanged
+from saga_fg.tracking.identities import exchanged
 from saga_fg.tracking.track_filters import Kinematics
 from saga_fg.types import Lane
 

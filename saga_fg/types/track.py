@@ -28,7 +28,9 @@ LONGEST = 20
 def html_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str | float | int]]) -> str:
     """Return a title and the first rows of a table; NaN is left empty."""
     head = "".join(f"<th>{html.escape(name)}</th>" for name in columns)
-    body = "".join(f"<tr>{''.join(f'<td>{_cell(value)}</td>' for value in row)}</tr>" for row in rows[:LONGEST])
+    body = "".join(
+        f"<tr>{''.join(f'<td>{html.escape(_text(value))}</td>' for value in row)}</tr>" for row in rows[:LONGEST]
+    )
     more = f"<p>and {len(rows) - LONGEST} more</p>" if len(rows) > LONGEST else ""
     return f"<p>{html.escape(title)}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{more}"
 
@@ -46,10 +48,6 @@ def _text(value: str | float | int) -> str:
     if isinstance(value, float):
         return f"{value:.2f}" if value == value else ""
     return str(value)
-
-
-def _cell(value: str | float | int) -> str:
-    return html.escape(_text(value))
 
 
 def data_frame(columns: Mapping[str, Any]) -> Any:

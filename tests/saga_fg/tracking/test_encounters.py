@@ -22,7 +22,7 @@ from saga_fg.providers import Odometry, StartSettings
 from saga_fg.tracking import ClassSettings, EgoNodeSettings
 from saga_fg.tracking.association import LARGEST_EXACT, SWEEPS
 from saga_fg.tracking.edge_record import EdgeRecord, Trials
-from saga_fg.tracking.encounters import Encounters
+from saga_fg.tracking.identities import Encounters
 from saga_fg.tracking.map_nodes import FirstVehicles
 from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.tracking.track_filters import Kinematics

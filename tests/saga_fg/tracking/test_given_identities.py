@@ -7,7 +7,7 @@ import pytest
 
 from saga_fg import Boxes, Detections, Frame, InputError, Tracker, TrackerSettings
 from saga_fg.tracking import ClassSettings
-from saga_fg.tracking.given_identities import GivenIdentities
+from saga_fg.tracking.identities import GivenIdentities
 
 WALKERS = TrackerSettings({"default": ClassSettings(initial_speed_deviation=1.5)}, edges=())
 

@@ -12,7 +12,7 @@ from saga_fg import Boxes, Detections, Frame, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import FieldOfView, NoiseModel
 from saga_fg.numerics.arrays import Columns
 from saga_fg.numerics.geometry import yaw_transform
-from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings, unresolved
+from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings, track_life
 from saga_fg.tracking.track_life import LASTING_SHARE, reported_score
 from saga_fg.tracking.track_table import PRIOR_LOGIT, SensorEvidence, TrackTable
 from saga_fg.tracking.tracker_state import LIFETIME
@@ -322,7 +322,7 @@ def counted_tracks(label, spacing, seed):
 @pytest.mark.parametrize(("label", "spacing"), [("motorcycle", 1.2), ("pedestrian", 1.3)])
 def test_in_a_crowd_most_second_boxes_make_no_track_that_counts(monkeypatch, label, spacing):
     excess = np.mean([counted_tracks(label, spacing, seed) for seed in range(5)])
-    monkeypatch.setattr(unresolved, "OVERLAP", 2.0)
+    monkeypatch.setattr(track_life, "OVERLAP", 2.0)
     without = np.mean([counted_tracks(label, spacing, seed) for seed in range(5)])
     assert excess < 0.8 * without, (excess, without)
 
@@ -377,8 +377,8 @@ def test_a_miss_counts_against_a_track_where_the_surer_one_is_detected():
     for k, seen in enumerate(([(0.0, 0.0)], [(0.0, 0.0)], [(0.0, 0.0)], [], [(0.0, 0.0), (0.7, 0.0)])):
         tracker.step(crowd_frame(1.1 + 0.1 * k, seen, 0.6))
         left.append(tracker._state.table.unresolved.tolist())
-    alone, most = unresolved.ALONE, unresolved.MAX_FRAMES
-    expected = [unresolved.FRAMES + alone, most, most, most, most - 1]
+    alone, most = track_life.ALONE, track_life.MAX_FRAMES
+    expected = [track_life.FRAMES + alone, most, most, most, most - 1]
     assert left == [[0.0, frames] for frames in expected]
 
 

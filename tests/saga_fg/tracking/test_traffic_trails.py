@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from saga_fg import Curvilinear, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
-from saga_fg.tracking import ClassSettings, courses
+from saga_fg.tracking import ClassSettings, prediction
 from saga_fg.tracking.prediction import typical_speed
 from saga_fg.tracking.traffic import STEP, Passages, Traffic, TrafficSettings, paths
 from saga_fg.types.road_map import Lane, RoadMap
@@ -324,7 +324,7 @@ def test_where_nothing_tells_the_path_some_turn_off(monkeypatch):
         return tracker.predict([2.0, 4.0]).position_covariance[:, 0, 1, 1]
 
     grown = [across(speed) for speed in (3.0, 15.0)]
-    monkeypatch.setattr(courses, "TURNING_OFF", 0.0)
+    monkeypatch.setattr(prediction, "TURNING_OFF", 0.0)
     before = [across(speed) for speed in (3.0, 15.0)]
     share, hardest, time = 0.05, np.array([[0.3 * 3.0], [2.0]]), np.array([2.0, 4.0])
     ratio = np.subtract(grown, before) / (share * hardest**2 * time**4 / 4)

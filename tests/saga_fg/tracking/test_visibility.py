@@ -9,7 +9,7 @@ from saga_fg import Tracker, TrackerSettings
 from saga_fg.model.sensor import FieldOfView, Sensor
 from saga_fg.tracking import ClassSettings
 from saga_fg.tracking.track_table import MEMORY, SensorEvidence
-from saga_fg.tracking.visibility import visible_share
+from saga_fg.tracking.update import visible_share
 from saga_fg.types.boxes import Boxes
 from tests.saga_fg.traffic_frames import frame, run
 

@@ -305,7 +305,7 @@ def test_feet_on_many_polylines_are_those_on_each():
     found = Polylines.from_points(lines).feet(line, places)
     for k, each in enumerate(lines):
         mine = line == k
-        for column, alone in zip(found, feet(each, places[mine]), strict=True):
+        for column, alone in zip(vars(found).values(), vars(feet(each, places[mine])).values(), strict=True):
             np.testing.assert_allclose(column[mine], alone, atol=1e-12)
         brute = min_distance(each, places[mine])
         inside = (found.s[mine] > 0) & (found.s[mine] < np.hypot(*np.diff(each, axis=0).T).sum())
