@@ -12,6 +12,7 @@ import numpy as np
 
 from data_tools.datasets.detection_files import TableImport, TrackRows
 from data_tools.metrics import SceneBoxes
+from data_tools.metrics.misalignment import misalignment
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.tables import usual_class
@@ -71,13 +72,18 @@ class Results:
         innovations: Mapping[str, FloatArray] | None = None,
         metrics: Sequence[str | Metric] = (),
     ) -> Evaluation:
-        """Score the tracks. innovations: squared distances of the run, by class; metrics: a user's own."""
+        """Score the tracks, and warn where hardly any matches, with what would have matched.
+
+        innovations  squared distances of the run, by class; metrics: a user's own
+        """
         evaluation = self.score(self.scenes, hota, innovations)
+        pairs = [(each.scene, each.found) for each in self.scenes.values()]
+        if why := misalignment(pairs):
+            log.warning("%s", why)
         if not metrics:
             return evaluation
         from data_tools.evaluation import own_figures
 
-        pairs = [(each.scene, each.found) for each in self.scenes.values()]
         return replace(evaluation, own=own_figures(pairs, metrics))
 
 
@@ -150,14 +156,19 @@ def _at_moments(rows: TrackRows, scene: Scene, path: Path) -> TrackRows:
     if not len(times) or not len(scene):
         return rows.select(mine)
     step = float(np.median(np.diff(scene.timestamps))) if len(scene) > 1 else 1.0
+    reach = min(_NEAR_TIME, step / 4)
     nearest = times[nearest_rows(times, scene.timestamps)]
-    near = np.abs(nearest - scene.timestamps) <= min(_NEAR_TIME, step / 4)
+    near = np.abs(nearest - scene.timestamps) <= reach
     within = (scene.timestamps >= times[0] - step) & (scene.timestamps <= times[-1] + step)
     if not near.any() or near[within].mean() < 0.5:
+        later = scene.timestamps[0] - times[0]
+        moved = times[nearest_rows(times + later, scene.timestamps)] + later
+        fits = (np.abs(moved - scene.timestamps) <= reach).mean() >= 0.5
         raise InputError(
             f"{path}: scene {scene.name}: expected tracks at the times of the ground truth, {scene.timestamps[0]:.3f} "
             f"to {scene.timestamps[-1]:.3f} s every {step:.3g} s; they are at {times[0]:.3f} to {times[-1]:.3f} s, and "
-            f"{near.sum()} of {len(scene)} moments have one within {min(_NEAR_TIME, step / 4):.3g} s"
+            f"{near.sum()} of {len(scene)} moments have one within {reach:.3g} s"
+            + (f"; {later:+.6g} s later they would fit" if fits else "")
         )
     moment_of = dict(zip(nearest[near].tolist(), scene.timestamps[near].tolist(), strict=True))
     moved = np.array([moment_of.get(time, np.nan) for time in rows.timestamp[mine].tolist()])

@@ -114,6 +114,28 @@ def test_tracks_that_do_not_fit_the_truth(tmp_path):
         assert message is None or message in result.stderr
 
 
+def test_what_would_have_matched_is_told_where_nothing_does(tmp_path, caplog):
+    rng = np.random.default_rng(0)
+    start, velocity = rng.uniform(-50, 50, (6, 2)) + np.array([200, 0]), rng.uniform(-9, 9, (6, 2))
+    true = [
+        {"time": k / 10, "id": n, "label": "car", "x": x, "y": y}
+        for k in range(20)
+        for n, (x, y) in enumerate((start + k / 10 * velocity).tolist())
+    ]
+    gt, exchanged = write(tmp_path / "gt.csv", true), [row | {"x": row["y"], "y": row["x"]} for row in true]
+    theirs = write(tmp_path / "t.csv", exchanged)
+    judged = saga_fg("evaluate", "file", theirs, "--truth", gt, "--json", tmp_path / "f.json")
+    assert judged.exit_code == 0, judged.output
+    assert json.loads((tmp_path / "f.json").read_text())["sweep"]["overall"]["amota"] == 0
+    assert "with x and y exchanged, tracks would match 100% of the boxes" in caplog.text
+    caplog.clear()
+    assert saga_fg("evaluate", "file", write(tmp_path / "own.csv", true), "--truth", gt).exit_code == 0
+    assert "would match" not in caplog.text
+    late = write(tmp_path / "late.csv", [row | {"time": row["time"] + 1000} for row in true])
+    refused = saga_fg("evaluate", "file", late, "--truth", gt)
+    assert "-1000 s later they would fit" in " ".join(refused.stderr.split())
+
+
 def test_each_class_without_a_counterpart_is_told(tmp_path, caplog):
     for theirs, alone, classes in [
         ({"v0": "X"}, "tracks of X and true objects of BUS", "BUS=X"),
