@@ -2,6 +2,8 @@
 
 Every contender tracks every recording, with all detections and with some taken away.
 Intervals are paired bootstraps over recordings; those that overlap in time count as one.
+
+Figures of runs through gaps: means with intervals over recordings, and by the situation of the hidden object.
 """
 
 from __future__ import annotations
@@ -9,44 +11,147 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import typer
 
-from benchmarks.bootstrap import difference, relative_change
-from benchmarks.gap_figures import by_cluster, compared, situation_figures
-from benchmarks.gap_picture import write_telling_picture
-from benchmarks.gap_runs import LIVES, GapBenchSettings, Judgement, LivedRun, bench_gaps
-from benchmarks.recording_sets import TRAFFIC_SETS, RecordingOptions, RecordingSet, chosen_sets
-from benchmarks.recordings.sensed import ABOVE
-from benchmarks.runner import Data, Row, Rows, chosen
-from benchmarks.situations import SITUATIONS
+from benchmarks.gap_runs import LIVES, SITUATIONS, GapBenchSettings, Judgement, LivedRun, Prediction, bench_gaps
+from benchmarks.recording_sets import TRAFFIC_SETS, RecordingOptions, chosen_sets
+from benchmarks.recordings.sources import ABOVE
+from benchmarks.runner import (
+    Comparison,
+    Data,
+    Interval,
+    Row,
+    Rows,
+    chosen,
+    difference,
+    paired_bootstrap,
+    ratio_of_sums,
+    relative_change,
+)
 from benchmarks.variants import contenders
-from pipelines.cli.console import progress_bar, writable
+from data_tools.metrics import coverage
+from pipelines.cli.console import progress_bar
 from pipelines.cli.options import Config
-from pipelines.config import TrackConfig, load_config
-from pipelines.learning import learned_motions
-from pipelines.learning.interactions import LEARNED, Contender, LearningSettings, learn_interactions
-from pipelines.tracking import Progress
+from pipelines.config import load_config
 from saga_fg.errors import InputError
-from saga_fg.learning import measured_trajectories
 from saga_fg.learning.labelled_scene import LENGTHS, Gap
 from saga_fg.numerics import FloatArray
 
-FITS = ("noise", "edges")
-LEARNING = LearningSettings(passes=1, most=100)  # there is a fit to every fold, and a half of the usual tells enough
+PROBABILITIES = (0.5, 0.9)
+FEWEST_RECORDINGS, FEWEST_GAPS = 3, 5  # of an interval
+
+
+@dataclass(frozen=True)
+class SituationFigure:
+    """One contender at one time after the start of made gaps, in one situation.
+
+    gaps      in which the track is still among the results;  lost: others
+    error     mean, m, not capped; error_change: relative to the reference, over gaps in which both have a track
+    median    of the errors, m
+    nll       mean negative logarithm of the density of the true position, nats; nll_change: a difference
+    coverage  share of true positions within the ellipse of each probability
+    """
+
+    situation: str
+    length: float
+    contender: str
+    gaps: int
+    lost: int
+    error: Interval
+    error_change: Interval | None
+    median: float
+    nll: Interval
+    nll_change: Interval | None
+    coverage: Mapping[float, float]
+
+
+def situation_figures(runs: Sequence[LivedRun], reference: str) -> list[SituationFigure]:
+    """All lengths, situations that occur, and contenders, of runs whose tracks are kept alive."""
+    mine = {name: [run for run in runs if run.contender == name] for name in dict.fromkeys(r.contender for r in runs)}
+    base = mine.get(reference, next(iter(mine.values()), []))
+    figures = []
+    for length in LENGTHS:
+        for situation in SITUATIONS:
+            if any(situation in at.get(length, ()) for run in base for at in run.situations):
+                figures += [_figure(situation, length, found, base) for found in mine.values()]
+    return figures
+
+
+def _figure(situation: str, length: float, runs: Sequence[LivedRun], base: Sequence[LivedRun]) -> SituationFigure:
+    def values(of: Sequence[LivedRun], value: Callable[[Prediction], float]) -> list[FloatArray]:
+        return by_cluster(of, lambda run: _values(run, situation, length, value))
+
+    error, nll = (lambda found: found.error), (lambda found: found.nll)
+    errors, densities, nees = values(runs, error), values(runs, nll), values(runs, lambda found: found.nees)
+    changes: list[Interval | None] = [None, None]
+    if runs[0].contender != base[0].contender:
+        changes = [
+            compared(errors, values(base, error), relative_change),
+            compared(densities, values(base, nll), difference),
+        ]
+    every, squares = (np.concatenate(each) for each in (errors, nees))
+    known = every[np.isfinite(every)]
+    return SituationFigure(
+        situation=situation,
+        length=length,
+        contender=runs[0].contender,
+        gaps=len(known),
+        lost=len(every) - len(known),
+        error=interval(errors),
+        error_change=changes[0],
+        median=float(np.median(known)) if len(known) else float("nan"),
+        nll=interval(densities),
+        nll_change=changes[1],
+        coverage={p: coverage(squares[np.isfinite(squares)], p) for p in PROBABILITIES},
+    )
+
+
+def _values(run: LivedRun, situation: str, length: float, value: Callable[[Prediction], float]) -> FloatArray:
+    """Values of the gaps in the situation, NaN where the track is lost."""
+    found = [
+        outcome.predicted.get(length)
+        for outcome, at in zip(run.outcomes, run.situations, strict=True)
+        if situation in at.get(length, ())
+    ]
+    return np.array([float("nan") if each is None else value(each) for each in found], dtype=np.float64)
+
+
+def by_cluster(runs: Sequence[LivedRun], values: Callable[[LivedRun], FloatArray]) -> list[FloatArray]:
+    """The values of the runs, those on recordings that overlap as one."""
+    found: dict[str, list[FloatArray]] = {}
+    for run in runs:
+        found.setdefault(run.cluster, []).append(values(run))
+    return [np.concatenate(each) for each in found.values()]
+
+
+def compared(ours: Sequence[FloatArray], theirs: Sequence[FloatArray], compare: Comparison) -> Interval | None:
+    """The change of the mean over gaps that both have a value of; None where there are none."""
+    a, b = [], []
+    for mine, other in zip(ours, theirs, strict=True):
+        both = np.isfinite(mine) & np.isfinite(other)
+        if both.any():
+            a.append((mine[both].sum(), both.sum()))
+            b.append((other[both].sum(), both.sum()))
+    if not a:
+        return None
+    found = paired_bootstrap(np.array(a), np.array(b), ratio_of_sums, compare)
+    if len(a) < FEWEST_RECORDINGS or sum(n for _, n in a) < FEWEST_GAPS:
+        return replace(found, low=float("nan"), high=float("nan"))
+    return found
+
+
+def interval(values: Sequence[FloatArray]) -> Interval:
+    """The mean of the known values, NaN where there are none."""
+    found = compared(values, values, lambda ours, _theirs: ours)
+    return Interval(float("nan"), float("nan"), float("nan"), 0.95) if found is None else found
+
+
 CONTENDERS = "saga,without trails,without lights,kf,constant velocity,turn,stationary,stationary + turn,centerpoint"
 FEWEST = 10  # gaps of a class that has rows of its own
 TITLES = {"kept": "tracks kept alive", "shipped": "tracks end as configured"}
-
-
-def _writable_picture(path: Path | None) -> Path | None:
-    """Refuse a file that cannot be written, or whose name does not say that it is a PNG file."""
-    if path is not None and path.suffix.lower() != ".png":
-        raise InputError(f"{path}: expected a name that ends in .png")
-    return writable(path)
 
 
 @dataclass(frozen=True)
@@ -65,18 +170,6 @@ class GapOptions:
             metavar="NAME[:METHOD]=FILE",
         ),
     ] = None
-    folds: Annotated[
-        str | None,
-        typer.Option(
-            "--folds",
-            help="Judge each of so many folds of the recordings after a fit to the others; place: each site of ngsim, "
-            "setting of openacc, recording of others.",
-            metavar="N|place",
-        ),
-    ] = None
-    fit: Annotated[
-        str, typer.Option("--fit", help="To the other folds, with commas: the noise of kf, the edges of saga.")
-    ] = "noise,edges"
     passes: Annotated[
         int, typer.Option("--passes", min=0, help="Runs over each recording with made gaps; 0: real gaps alone.")
     ] = 2
@@ -116,16 +209,6 @@ class ShownOptions:
         bool,
         typer.Option("--situations", help="Tables by situation as well: leaders, halting, turning, at red, ..."),
     ] = False
-    picture: Annotated[
-        Path | None,
-        typer.Option(
-            "--picture",
-            help="Draw the gap in which the first contender does better than that of --against by most, in the first "
-            "set, to this PNG file.",
-            metavar="FILE",
-            callback=_writable_picture,
-        ),
-    ] = None
 
 
 def gaps(
@@ -149,15 +232,13 @@ def gaps(
       python -m benchmarks gaps --data data --sets megvii,kitti --json gaps.json
       python -m benchmarks gaps --data data --sets kitti --contenders saga,kf --contender trial=trial.yaml
       python -m benchmarks gaps --data data --sets ngsim --life kept --lengths 3,5 --situations
-      python -m benchmarks gaps --data data --sets ngsim --life kept --folds place --fit edges --situations
-      python -m benchmarks gaps --data data --sets ngsim --life kept --picture gap.png --of 'at red'
-      python -m benchmarks gaps --data data --sets openacc --life kept --longest 20 --folds 2
+      python -m benchmarks gaps --data data --sets ngsim --life kept --of 'at red'
+      python -m benchmarks gaps --data data --sets openacc --life kept --longest 20
     """
     found = chosen_sets(
         recorded.sets, data, recorded.scenes, recorded.test, recorded.viewpoint, recorded.longest, usual=ABOVE
     )
     wanted = chosen("--of", made.of, SITUATIONS) if made.of is not None else ()
-    fits = chosen("--fit", made.fit, FITS)
     settings = GapBenchSettings(
         made.passes, LIVES if made.life == "both" else (made.life,), chosen_lengths(made.lengths), of=wanted
     )
@@ -170,65 +251,15 @@ def gaps(
         chosen("--against", made.against, [one.name for one in tried])
         judged = replace(settings, real=not complete)  # from above nothing is hidden, there are no gaps but made ones
         with progress_bar(unit="runs") as progress:
-            runs = split_runs(recordings, made.folds, fits, tried, base, judged, progress)
+            runs = bench_gaps(recordings, recordings.dataset.scenes, tried, judged, progress)
         if not any(run.gaps for run in runs):
             raise InputError(f"set {recordings.name}: expected recordings with gaps: longer ones, or more --passes")
         yield from rows_of(recordings.name, runs, made.against, shown.by_class, shown.situations)
-        if shown.picture is not None and recordings is found[0]:
-            better = next((one for one in tried if one.name != made.against), tried[0])
-            pair = [next(one for one in tried if one.name == made.against), better]
-            write_telling_picture(shown.picture, recordings, runs, pair, wanted)
 
 
 def chosen_lengths(text: str) -> tuple[float, ...]:
     """Lengths of made gaps, s. Raises `InputError` for others than those there are."""
     return tuple(sorted(map(float, chosen("--lengths", text, [f"{length:g}" for length in LENGTHS]))))
-
-
-def split_runs(
-    recordings: RecordingSet,
-    folds: str | None,
-    fits: Sequence[str],
-    tried: Sequence[Contender],
-    base: TrackConfig,
-    settings: GapBenchSettings,
-    progress: Progress | None = None,
-) -> list[LivedRun]:
-    """All runs on the recordings; with folds, of contenders fitted to the other ones as well."""
-    runs: list[LivedRun] = []
-    for train, test in splits_of(recordings, folds):
-        fitted: list[Contender] = []
-        if train and "noise" in fits:
-            trajectories = measured_trajectories(map(recordings.scene, train), base.sensors)
-            motions = learned_motions(trajectories, base)
-            fitted.append(Contender("kf, fitted noise", "kf", base.with_motions(motions)))
-        if train and "edges" in fits:
-            truth = {name: recordings.scene(name) for name in train}
-            learned = learn_interactions(truth, f"recordings {', '.join(train)}", base, None, LEARNING, progress)
-            fitted.append(Contender(f"saga, {LEARNED}", "saga", base.with_interactions(learned.interactions)))
-        runs += bench_gaps(recordings, test, [*tried, *fitted], settings, progress)
-    return runs
-
-
-def splits_of(recordings: RecordingSet, folds: str | None) -> list[tuple[tuple[str, ...], tuple[str, ...]]]:
-    """Recordings to fit to, and others to judge on; those of one place, or that overlap in time, are in one fold.
-
-    Raises `InputError` for more folds than there are units to deal.
-    """
-    every = tuple(recordings.dataset.scenes)
-    if folds is None:
-        return [((), every)]
-    if folds != "place" and not (folds.isascii() and folds.isdecimal() and int(folds) >= 2):
-        raise InputError(f"--folds: expected a number of 2 or more, or place, got {folds!r:.40}")
-    unit = {name: recordings.clusters.get(name, name) for name in every}
-    if folds == "place" and recordings.name in TRAFFIC_SETS:
-        unit = {name: name.partition("-")[0] for name in every}
-    units = list(dict.fromkeys(unit.values()))
-    number = len(units) if folds == "place" else int(folds)
-    if not 2 <= number <= len(units):
-        raise InputError(f"--folds {folds}: expected recordings for two folds or more, there are {len(units)} units")
-    tests = [tuple(name for name in every if unit[name] in units[k::number]) for k in range(number)]
-    return [(tuple(name for name in every if name not in test), test) for test in tests]
 
 
 class Group(NamedTuple):

@@ -27,9 +27,8 @@ import numpy as np
 import typer
 from scipy.spatial.transform import Rotation
 
-from benchmarks.bootstrap import paired_bootstrap
 from benchmarks.online_joint import OnlineEstimator
-from benchmarks.runner import Row, Rows, each
+from benchmarks.runner import Row, Rows, each, paired_bootstrap
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.simulator import SimulatorSettings, simulate_scene
 from data_tools.trajectories import Trajectory, TrajectoryErrors, trajectory_errors

@@ -28,6 +28,7 @@ import numpy as np
 import typer
 
 from benchmarks.runner import PROGRAM, Rows, Seed, chosen, each
+from benchmarks.scans import SimulatedScans, write_recording
 from data_tools.files import LEFTOVER
 from pipelines.scale_out.run import OF_THE_RUN
 
@@ -42,6 +43,7 @@ RECORDINGS = (
 )
 MARK = "SAGA_FG_KILLED"  # in the environment of everything that a command starts
 IN_A_ROW = 4  # kills before a command runs to its end
+SCANS = 20  # of the recording of `slam`
 PATIENCE = 600.0  # s for a run that is not killed
 
 
@@ -61,7 +63,7 @@ COMMANDS = {
     "smooth": Killed(("smooth", *RECORDINGS, "--output", "labels"), "labels"),
     "smooth --workers": Killed(("smooth", *RECORDINGS, "--output", "labels", "--workers", "2"), "labels", True),
     "benchmark": Killed(("benchmark", *RECORDINGS, "--output", "figures", "--workers", "1"), "figures", True),
-    "slam": Killed(("slam", "simulated", "--duration", "4", "--output", "slam"), "slam"),
+    "slam": Killed(("slam", "scans", "../scans", "--output", "slam"), "slam"),
 }
 
 
@@ -84,6 +86,7 @@ def kills(
     rng = np.random.default_rng(seed)
     with TemporaryDirectory() as folder:
         place = Path(folder)
+        write_recording(SimulatedScans(seed, SCANS), place / "scans")
         _run(place, ("simulate", "--output", "sim", "--scenes", str(scenes), "--seed", str(seed)))
         for name in chosen("--commands", commands, tuple(COMMANDS)):
             yield f"{times} kills each", {"command": name, **_killed(COMMANDS[name], place, times, rng)}

@@ -7,29 +7,326 @@ together    both methods' tracks refined to one result
 detections  labels from the detections that all of them had, by `saga-fg smooth`; tracked: by `saga-fg track`
 headings    of these labels: the share that is turned round, of boxes that match a true object, all and handed out
 doubt       of these labels: how often what they say with a probability is so
-corrected   by an annotator who knows the truth and looks at a tenth of their tracks (`benchmarks.annotator`)
+corrected   by an annotator who knows the truth and looks at a tenth of their tracks (`benchmarks.labels`)
+
+Errors of labels against the truth, and an annotator who knows the truth and corrects the tracks looked at.
+
+Labels are handed out where P(exists) >= `KEPT`. Their errors, track by track:
+
+    false    a track of which less than half of the boxes is within `GATE` of a true object of any class: once
+    class    a track more than half of whose boxes are at true objects of other classes: once
+    join     a change from one true object to another, between boxes that match
+    off      a box of a true track that is off by `FAR_OFF` or `TURNED_OFF`, from the true one that it matches
+    missed   a visible true box, detected within `GATE`, that no label matches
+
+The annotator looks at tracks and says which exist and of which class they are. Then the scene is solved again, joins
+are cut, and the box in the middle of the longest run of boxes that are off is given; twice again where some are left.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from benchmarks.annotator import Answers, Corrected, JudgedLabels, judged, moments_of
 from benchmarks.recording_sets import RecordingOptions, RecordingSet, chosen_sets
 from benchmarks.runner import Data, Row, Rows, Seed, each
 from data_tools.datasets.given_tracks import sensor_names, with_tracks
 from data_tools.datasets.results import SceneResult
-from data_tools.metrics import LabelErrors, SceneBoxes, error_summary
+from data_tools.metrics import LabelErrors, SceneBoxes, error_summary, placed_detections
+from data_tools.metrics.scene_boxes import nearest_pairs
 from pipelines.config import Method, load_config
 from pipelines.smoothing import for_given_tracks, label_model, load_smooth_config, smooth_scene
 from pipelines.tracking import TrackedScene, track_scene
-from saga_fg.smoothing import LabelBuilder
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, wrap_angle
+from saga_fg.smoothing import LabelBuilder, Labels, Probabilities, RecordingLabels
+from saga_fg.smoothing.corrections import checked_corrections
 from saga_fg.types import Scene, Tracks
+
+KEPT = 0.5
+GATE = 2.0  # m
+FAR_OFF, TURNED_OFF = 0.5, np.pi / 9  # m and rad
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedLabels:
+    """N labels of a scene against its truth.
+
+    found    the labels; truth: the true boxes of classes that are detected
+    own      (N,) row of the true box that a label matches, -1 for none; any: of whatever class is near
+    off      (N,) whether it is far off it; turned: by more than 90 degrees; kept (N,) whether it is handed out
+    missed   (M,) which true boxes are missed
+    """
+
+    found: SceneBoxes
+    truth: SceneBoxes
+    own: IntArray
+    any: IntArray
+    off: BoolArray
+    turned: BoolArray
+    kept: BoolArray
+    missed: BoolArray
+
+    def tracks(self) -> dict[str, IntArray]:
+        """The rows of each track, in order of time."""
+        order = np.argsort(self.found.id, kind="stable")
+        names, starts = np.unique(self.found.id[order], return_index=True)
+        return dict(zip(names.tolist(), np.split(order, starts[1:]), strict=True))
+
+    def is_false(self, rows: IntArray) -> bool:
+        """Whether these are the labels of no true object."""
+        return bool((self.any[rows] >= 0).mean() < 0.5)
+
+    def is_other_class(self, rows: IntArray) -> bool:
+        """Whether these are the labels of an object of another class."""
+        return not self.is_false(rows) and bool((self.own[rows] >= 0).mean() < 0.5)
+
+    def joins(self, rows: IntArray) -> list[tuple[int, int]]:
+        """Pairs of successive rows between which a track changes from one true object to another."""
+        rows = rows[self.own[rows] >= 0]
+        name = self.truth.id[self.own[rows]]
+        changed = name[:-1] != name[1:]
+        return [(int(a), int(b)) for a, b in zip(rows[:-1][changed], rows[1:][changed], strict=True)]
+
+    def errors(self) -> dict[str, int]:
+        """Numbers of errors by kind."""
+        counts = dict.fromkeys(("false", "class", "join", "off", "missed"), 0)
+        for rows in self.tracks().values():
+            if not self.kept[rows[0]]:
+                continue
+            if self.is_false(rows):
+                counts["false"] += 1
+            else:
+                counts["class"] += self.is_other_class(rows)
+                counts["join"] += len(self.joins(rows))
+                counts["off"] += int(self.off[rows].sum())
+        counts["missed"] = int(self.missed.sum())
+        return counts
+
+
+def judged(scene: Scene, labels: Sequence[Labels]) -> JudgedLabels:
+    """Compare labels with the truth of their scene."""
+    assert scene.ground_truth is not None
+    found = SceneBoxes.of_tracks([moment.tracks for moment in labels])
+    frame, boxes = placed_detections(scene)
+    classes = np.unique(np.concatenate([boxes.label, found.boxes.label]))
+    truth = SceneBoxes.of_annotations(scene.ground_truth)
+    visible = np.concatenate([moment.visible for moment in scene.ground_truth])
+    kept = np.concatenate([np.empty(0), *(moment.probability.exists for moment in labels)]) >= KEPT
+    own, any_ = np.full(len(found), -1), np.full(len(found), -1)
+    row, column, distance = nearest_pairs((truth.frame, truth.boxes), (found.frame, found.boxes), GATE)
+    own[column] = row
+    off, turned = np.zeros((2, len(found)), dtype=np.bool_)
+    angle = np.abs(wrap_angle(truth.boxes.yaw[row] - found.boxes.yaw[column]))
+    off[column] = visible[row] & ((distance > FAR_OFF) | (angle > TURNED_OFF))
+    turned[column] = angle > np.pi / 2
+    alike = [(table.frame, replace(table.boxes, label=np.full(len(table), "any"))) for table in (truth, found)]
+    row, column, _ = nearest_pairs(alike[0], alike[1], GATE)
+    any_[column] = row
+    other = own >= 0
+    any_[other] = own[other]
+    seen = np.zeros(len(truth), dtype=np.bool_)
+    seen[nearest_pairs((truth.frame, truth.boxes), (frame, boxes), GATE)[0]] = True
+    matched = np.zeros(len(truth), dtype=np.bool_)
+    handed = found.select(np.flatnonzero(kept))
+    matched[nearest_pairs((truth.frame, truth.boxes), (handed.frame, handed.boxes), GATE)[0]] = True
+    missed = visible & seen & ~matched & np.isin(truth.boxes.label, classes)
+    return JudgedLabels(found, truth, own, any_, off, turned, kept, missed)
+
+
+BINS = (0.0, 0.1, 0.5, 0.9, 1.0)
+
+
+class Answers:
+    """What labels say of objects, and what is so: by question rows of both and a weight."""
+
+    def __init__(self) -> None:
+        self.said: dict[str, list[tuple[float, float, float]]] = {}
+
+    def add(self, scene: JudgedLabels, labels: Sequence[Labels]) -> None:
+        """Ask whether the objects of a scene exist, and of those that do whether class, identity and heading are
+        right; headings count by boxes."""
+        p = Probabilities.concatenate([moment.probability for moment in labels])
+
+        def answer(question: str, said: FloatArray, right: float, weight: float = 1.0) -> None:
+            self.said.setdefault(question, []).append((float(said[rows[0]]), float(right), float(weight)))
+
+        for rows in scene.tracks().values():
+            own = scene.own[rows] >= 0
+            answer("exists", p.exists, own.mean() > 0.5)
+            if not scene.is_false(rows):
+                answer("class", p.label, own.mean() > 0.5)
+            if own.mean() > 0.5:
+                answer("identity", p.one, not scene.joins(rows))
+                answer("heading", p.heading, 1 - scene.turned[rows][own].mean(), own.sum())
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """A row for each question and range of what was said."""
+        for question, answers in self.said.items():
+            said, true, weight = np.array(answers).reshape(-1, 3).T
+            for low, high in pairwise(BINS):
+                mine = (said >= low) & ((said < high) | (high == 1.0))
+                if mine.any():
+                    figures = (float(np.average(column[mine], weights=weight[mine])) for column in (said, true))
+                    yield {"question": question, "from": low, "to": high, "objects": int(mine.sum())} | dict(
+                        zip(("said", "is"), figures, strict=True)
+                    )
+
+
+RUN = 3  # boxes in a row that are off, from which one is given
+LOOKS = 3  # boxes that the annotator gives a track, one after the other, where they are still off
+
+
+class Annotator:
+    """Looks at tracks, knows the truth, and says what is wrong with them."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+
+    def looks_at(self, now: JudgedLabels, ids: Iterable[str], whole: bool) -> list[dict[str, Any]]:
+        """Corrections of tracks as a whole, else of joins and boxes."""
+        tracks = now.tracks()
+        rows = [tracks[id_] for id_ in ids if id_ in tracks]
+        say = self._whole if whole else self._parts
+        return [correction for mine in rows for correction in say(now, mine)]
+
+    def _place(self, now: JudgedLabels, row: int) -> dict[str, Any]:
+        (x, y), at = now.found.boxes.position[row, :2].tolist(), float(self._scene.timestamps[now.found.frame[row]])
+        return {"time": at, "x": x, "y": y, "label": str(now.found.boxes.label[row])}
+
+    def _whole(self, now: JudgedLabels, rows: IntArray) -> Iterator[dict[str, Any]]:
+        """What is wrong with a whole track."""
+        matched = rows[now.any[rows] >= 0]
+        if now.is_false(rows):
+            yield {"what": "exists", "at": self._place(now, int(rows[len(rows) // 2])), "value": False}
+            return
+        at = self._place(now, int(matched[len(matched) // 2]))
+        if not now.kept[rows[0]]:
+            yield {"what": "exists", "at": at, "value": True}
+        if now.is_other_class(rows):
+            names, counts = np.unique(now.truth.boxes.label[now.any[matched]], return_counts=True)
+            yield {"what": "class", "at": at, "label": str(names[np.argmax(counts)])}
+
+    def _parts(self, now: JudgedLabels, rows: IntArray) -> Iterator[dict[str, Any]]:
+        """What is wrong with some of the boxes."""
+        if now.is_false(rows):
+            return
+        for a, b in now.joins(rows):
+            yield {"what": "same", "at": self._place(now, a), "and": self._place(now, b), "value": False}
+        off = rows[now.off[rows]]
+        if len(off):
+            run = max(np.split(off, np.flatnonzero(np.diff(now.found.frame[off]) > 1) + 1), key=len)
+            if len(run) < RUN:
+                return
+            row = int(run[len(run) // 2])
+            true = now.truth.boxes.select([now.own[row]])
+            (x, y, z), (length, width, height) = true.position[0].tolist(), true.size[0].tolist()
+            box = {
+                "x": x,
+                "y": y,
+                "z": z,
+                "yaw": float(true.yaw[0]),
+                "length": length,
+                "width": width,
+                "height": height,
+            }
+            yield {"what": "box", "at": self._place(now, row), "box": box}
+
+
+@dataclass
+class Account:
+    """What the annotator did in some scenes: errors before and after; boxes that are off or missing once it is said
+    what exists, and after; the corrections that gave a box or a join, and all."""
+
+    before: int = 0
+    after: int = 0
+    boxes_before: int = 0
+    boxes_after: int = 0
+    given: int = 0
+    corrections: int = 0
+    looks: int = 0
+    unfit: int = 0
+
+    def figures(self) -> dict[str, float]:
+        """The figures of all scenes."""
+        mended = (self.boxes_before - self.boxes_after) / max(self.given, 1)
+        return {
+            "looks": self.looks,
+            "corrections": self.corrections,
+            "unfit": self.unfit,
+            "errors": self.before,
+            "gone": 1 - self.after / max(self.before, 1),
+            "boxes each": mended,
+        }
+
+
+class Corrected:
+    """Labels of scenes as an annotator leaves them, who looks at a tenth of the tracks: of the whole list, or as many
+    as a tenth of those handed out; by the list, or at random."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self.accounts: dict[str, Account] = {}
+        self.seconds: list[tuple[float, float]] = []  # of a single correction, of everything
+
+    def add(self, scene: Scene, builder: LabelBuilder, labels: RecordingLabels, whole: float) -> None:
+        """Correct the labels of a scene, which took `whole` seconds."""
+        before, review = judged(scene, moments_of(labels)), labels.review(0.0)
+        ids = review.id.astype(np.str_)
+        handed = int((review.probability.exists >= KEPT).sum())
+        out = ids[review.probability.exists >= KEPT]
+        tenth = max(1, round(handed / 10))
+        ways = {
+            "a tenth of the list, first": ids[: round(len(ids) / 10)],
+            "a tenth of the list, random": self._rng.choice(ids, round(len(ids) / 10), replace=False),
+            "a tenth of those handed out, first": ids[:tenth],
+            "a tenth of those handed out, random": self._rng.choice(out, tenth, replace=False),
+        }
+        for way, chosen in ways.items():
+            self._annotate(way, scene, builder, before, chosen.tolist())
+        annotator = Annotator(scene)
+        for id_ in ids[:3].tolist():
+            one = checked_corrections(
+                [one for whole in (False, True) for one in annotator.looks_at(before, [id_], whole)][:1]
+            )
+            start = time.perf_counter()
+            builder.corrected(one)
+            self.seconds.append((time.perf_counter() - start, whole))
+
+    def _annotate(self, way: str, scene: Scene, builder: LabelBuilder, before: JudgedLabels, ids: list[str]) -> None:
+        annotator, account, now = Annotator(scene), self.accounts.setdefault(way, Account()), before
+        records: list[dict[str, Any]] = []
+        errors = [before.errors()]
+        for look in range(1 + LOOKS):
+            records += annotator.looks_at(now, ids, whole=look == 0)
+            if records:
+                labels, _ = builder.corrected(checked_corrections(records))
+                now = judged(scene, moments_of(labels))
+            errors.append(now.errors())
+        account.before += sum(errors[0].values())
+        account.after += sum(errors[-1].values())
+        account.boxes_before += errors[1]["off"] + errors[1]["missed"]
+        account.boxes_after += errors[-1]["off"] + errors[-1]["missed"]
+        account.given += sum(record["what"] in ("box", "same") for record in records)
+        account.corrections += len(records)
+        account.looks += len(ids)
+        account.unfit += sum(why != "" for _, why in builder.outcomes) if records else 0
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """A row for each way to choose the tracks, and the time from a correction to new labels."""
+        seconds, whole = np.median(np.array(self.seconds), axis=0).tolist()
+        for way, account in self.accounts.items():
+            yield {"looked at": way, **account.figures(), "seconds": seconds, "of whole": seconds / whole}
+
+
+def moments_of(labels: RecordingLabels) -> list[Labels]:
+    """The labels of all moments."""
+    return [moment for part in labels for moment in part]
+
 
 METHODS: tuple[Method, ...] = ("centerpoint", "kf")
 GRAPH: Method = "saga"

@@ -26,7 +26,7 @@ import typer
 
 from benchmarks.recording_sets import recording_set
 from benchmarks.runner import Data, Row, Rows, Seed, counts, growth, in_turn
-from benchmarks.service.round_trip import round_trips
+from benchmarks.service.served import round_trips
 from pipelines.config import Method, TrackConfig, load_config
 from saga_fg.model import Neighbours, SharedVelocity
 from saga_fg.tracking import Stage, TrackerView

@@ -15,6 +15,7 @@ import numpy as np
 from birds_eye_picture import write_birds_eye_picture
 from concept_pictures import write_concept_pictures
 from crowd_picture import write_crowd_picture
+from gap_picture import write_gap_picture
 from heterogeneous_picture import write_heterogeneous_picture
 from scaling_picture import write_scaling_picture
 from slam_loops_picture import write_loops_picture
@@ -74,11 +75,7 @@ def main() -> None:
     write_heterogeneous_picture(HERE)
     write_loops_picture(HERE)
     if data := os.environ.get("SAGA_FG_DATA"):
-        gap = "-m benchmarks gaps --sets ngsim --test USA_US101-12_1_T-1 --passes 2 --lengths 3,5 --life kept"
-        subprocess.run(
-            [sys.executable, *gap.split(), "--contenders", "saga,kf", "--data", data, "--picture", HERE / "gap.png"],
-            check=True,
-        )
+        write_gap_picture(HERE / "gap.png", Path(data))
     with tempfile.TemporaryDirectory() as folder:
         result = run_demo(Path(folder) / "demo", load_config("simulated"))
         write_birds_eye_picture(HERE / "birds_eye.png", result.comparison, load_config("simulated"))

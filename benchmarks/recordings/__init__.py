@@ -1,10 +1,9 @@
 """Recordings of research as datasets of the command: `benchmarks.recordings:Ngsim`, `:OpenAcc` and `:EthUcySource`;
 drives past landmarks, `read_landmark_log`."""
 
-from benchmarks.recordings.eth_ucy import EthUcySource
+from benchmarks.recordings.crowds import EthUcySource
 from benchmarks.recordings.landmarks import LandmarkLog, read_landmark_log
-from benchmarks.recordings.sensed import ABOVE, MAST, VEHICLE
-from benchmarks.recordings.sources import Ngsim, OpenAcc, TrafficScenes
+from benchmarks.recordings.sources import ABOVE, MAST, VEHICLE, Ngsim, OpenAcc, TrafficScenes
 from benchmarks.recordings.traffic import RecordedTraffic, Recordings, overlapping
 
 __all__ = [

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.class_figures import class_rows, rank_quality
+from benchmarks.recording_sets import class_rows, rank_quality
 from data_tools.metrics import NuScenesTrackingScene, SceneBoxes
 from saga_fg import Boxes
 

@@ -10,8 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from benchmarks.bootstrap import Interval
-from benchmarks.runner import Rows, application, environment, growth, in_turn, resampled, tables, text
+from benchmarks.runner import Interval, Rows, application, environment, growth, in_turn, resampled, tables, text
 from saga_fg.errors import SagaError
 
 

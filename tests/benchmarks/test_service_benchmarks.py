@@ -15,8 +15,7 @@ from benchmarks.kills import Killed, _damage, _kill, _marked
 from benchmarks.scaling import APART, JOINT, NODES, SEPARATE, JointGraphTracking, SeparateGraphTracking, flock
 from benchmarks.service import clocks
 from benchmarks.service.clocks import ClockFault, fault_rows, offset_figures, offset_shortcomings
-from benchmarks.service.good_client import GoodClient
-from benchmarks.service.hostile_service import bench_hostile_service, shortcomings
+from benchmarks.service.hostile_service import GoodClient, bench_hostile_service, shortcomings
 from benchmarks.speed import METHODS, Ties, speed_config, speed_frames
 from pipelines.config import Method
 from saga_fg.errors import SagaError

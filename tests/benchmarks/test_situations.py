@@ -5,9 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from benchmarks.gap_figures import situation_figures
-from benchmarks.gap_runs import Judgement, LivedRun, Prediction, judgement
-from benchmarks.situations import route_of, situations_of
+from benchmarks.gap_runs import Judgement, LivedRun, Prediction, judgement, route_of, situations_of
+from benchmarks.gaps import situation_figures
 from pipelines.learning.interactions import JudgedRun
 from saga_fg import Annotations, Boxes, Detections, Frame, Scene, Tracks
 from saga_fg.learning.labelled_scene import Gap, LabelledScene

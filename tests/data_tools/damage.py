@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.recordings.eth_ucy import EthUcy
+from benchmarks.recordings.crowds import EthUcy
 from benchmarks.recordings.landmarks import read_landmark_log
 from benchmarks.recordings.ngsim import ngsim_windows
 from benchmarks.recordings.openacc import openacc_platoons

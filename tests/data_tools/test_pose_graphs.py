@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from benchmarks.generated_graphs import city, torus
+from benchmarks.pose_graphs import city, torus
 from data_tools.files.readers import TextTable
 from data_tools.pose_graphs import read_g2o, write_g2o
 from saga_fg import InputError

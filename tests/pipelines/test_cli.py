@@ -16,7 +16,7 @@ import yaml
 from click import Context
 from typer.main import get_command
 
-from benchmarks.generated_graphs import torus
+from benchmarks.pose_graphs import torus
 from data_tools.datasets.nuscenes.source import sensor_locations
 from data_tools.datasets.source import names
 from data_tools.pose_graphs import write_g2o

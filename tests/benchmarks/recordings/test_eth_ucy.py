@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.recordings.eth_ucy import EthUcy
+from benchmarks.recordings.crowds import EthUcy
 from saga_fg.errors import InputError
 
 OBSMAT = """  780 1 8.0 0 3.0 1.0 0 0.0

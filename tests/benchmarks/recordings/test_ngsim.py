@@ -9,8 +9,7 @@ import pytest
 
 from benchmarks.recordings.lanelets import road_of
 from benchmarks.recordings.ngsim import ngsim_windows
-from benchmarks.recordings.sensed import true_scene
-from benchmarks.recordings.sources import TrafficScenes
+from benchmarks.recordings.sources import TrafficScenes, true_scene
 from benchmarks.recordings.traffic import SHARED_MOMENTS, RecordedTraffic, Recordings, overlapping
 from data_tools.simulator.traffic import SimulatedTrajectories
 from saga_fg.errors import InputError

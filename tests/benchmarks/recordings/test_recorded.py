@@ -9,8 +9,7 @@ import pytest
 
 from benchmarks.recordings.crossings import LENGTH, LINE, RULES, simulated_crossings
 from benchmarks.recordings.ngsim import ngsim_windows
-from benchmarks.recordings.sensed import sensed_scene, true_scene
-from benchmarks.recordings.sources import Ngsim
+from benchmarks.recordings.sources import Ngsim, sensed_scene, true_scene
 from benchmarks.recordings.traffic import RecordedTraffic, Recordings
 from data_tools.simulator.settings import SensorSettings, SimulatorSettings
 from pipelines.config import load_config

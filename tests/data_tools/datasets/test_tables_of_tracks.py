@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.recordings.eth_ucy import EthUcySource
+from benchmarks.recordings.crowds import EthUcySource
 from data_tools.datasets.detection_files import (
     LABEL_COLUMNS,
     read_detections,

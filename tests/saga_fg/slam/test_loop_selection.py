@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from benchmarks.generated_graphs import city, torus
 from benchmarks.loops import with_false_loops
+from benchmarks.pose_graphs import city, torus
 from data_tools.pose_graphs import read_g2o
 from saga_fg import InputError
 from saga_fg.numerics.arrays import FloatArray

@@ -15,13 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.gap_runs import LivedRun, judged_run, judgement
-from benchmarks.recording_sets import RecordingSet
-from benchmarks.situations import colours_at
+from benchmarks.gap_runs import GapBenchSettings, LivedRun, bench_gaps, colours_at, judged_run, judgement
+from benchmarks.recording_sets import chosen_sets
+from benchmarks.recordings.sources import ABOVE
+from benchmarks.variants import contenders
 from data_tools.figures import COLOURS, png
 from data_tools.files import write_bytes
-from pipelines.learning.interactions import CAP, Contender, JudgedRun
-from saga_fg.errors import InputError
+from pipelines.config import load_config
+from pipelines.learning.interactions import CAP, JudgedRun
 from saga_fg.learning.labelled_scene import Gap, LabelledScene
 from saga_fg.numerics import FloatArray
 
@@ -33,46 +34,32 @@ LIGHTS = {"red": "#d62728", "amber": "#ff9f0e", "green": "#2ca02c"}
 Turned = Callable[[FloatArray], FloatArray]  # points (n, 2) of the world as (2, n) along and across the object's way
 
 
-def telling_gap(
-    first: Sequence[LivedRun], second: Sequence[LivedRun], situations: Sequence[str] = ()
-) -> tuple[str, Gap]:
+def write_gap_picture(path: Path, data: Path) -> None:
+    """Draw the gap of a window of NGSIM in which `saga` does better than `kf` by most."""
+    (recordings,) = chosen_sets("ngsim", data, 1, "USA_US101-12_1_T-1", usual=ABOVE)
+    settings = GapBenchSettings(2, ("kept",), (3.0, 5.0), real=False)
+    pair = contenders(recordings.family, load_config(recordings.family), "kf,saga", ())
+    runs = bench_gaps(recordings, recordings.dataset.scenes, pair, settings)
+    first, second = ([run for run in runs if run.contender == one.name] for one in pair)
+    recording, gap = telling_gap(second, first)
+    labelled = LabelledScene.from_scene(recordings.scene(recording), pair[0].config.sensors)
+    together = [one for run in first if run.recording == recording for one in run.gaps if one.run == gap.run]
+    drawn = {one.name: judged_run(labelled, together, one, "kept") for one in pair}
+    write_bytes(path, png(gap_picture(labelled, gap, drawn)))
+
+
+def telling_gap(first: Sequence[LivedRun], second: Sequence[LivedRun]) -> tuple[str, Gap]:
     """The recording and the gap in which the first contender does better than the second by most.
 
-    Where identity is kept by the first alone; among those, or else among all, of largest difference of errors. With
-    situations, among made gaps in which the object is in one of them. Raises `InputError` where there is no gap.
+    Where identity is kept by the first alone; among those, or else among all, of largest difference of errors.
     """
-    best: tuple[tuple[int, float], str, Gap] | None = None
-    for ours, theirs in zip(first, second, strict=True):
-        for gap, at, mine, other in zip(ours.gaps, ours.situations, ours.outcomes, theirs.outcomes, strict=True):
-            if situations and all(each.isdisjoint(situations) for each in at.values()):
-                continue
-            gain = float(np.nan_to_num(min(other.error, CAP) - mine.error))
-            worth = (int(mine.kept) - int(other.kept), gain)
-            if best is None or worth > best[0]:
-                best = worth, ours.recording, gap
-    if best is None:
-        raise InputError("--picture: expected recordings with gaps of the situations asked for, there are none")
-    return best[1], best[2]
-
-
-def write_telling_picture(
-    path: Path,
-    source: RecordingSet,
-    runs: Sequence[LivedRun],
-    contenders: Sequence[Contender],
-    situations: Sequence[str] = (),
-) -> None:
-    """Draw the gap, in one of some situations or any, in which the second of two contenders beats the first by most.
-
-    Raises `InputError` for a path that is not writable, and where there is no gap.
-    """
-    life = runs[0].life
-    first, second = ([run for run in runs if (run.life, run.contender) == (life, c.name)] for c in contenders)
-    recording, gap = telling_gap(second, first, situations)
-    labelled = LabelledScene.from_scene(source.scene(recording), contenders[0].config.sensors)
-    together = [one for run in first if run.recording == recording for one in run.gaps if one.run == gap.run]
-    drawn = {one.name: judged_run(labelled, together, one, life) for one in contenders}
-    write_bytes(path, png(gap_picture(labelled, gap, drawn)))
+    every = [
+        ((int(mine.kept) - int(other.kept), float(np.nan_to_num(min(other.error, CAP) - mine.error))), ours, gap)
+        for ours, theirs in zip(first, second, strict=True)
+        for gap, mine, other in zip(ours.gaps, ours.outcomes, theirs.outcomes, strict=True)
+    ]
+    _, run, gap = max(every, key=lambda one: one[0])
+    return run.recording, gap
 
 
 def gap_picture(labelled: LabelledScene, gap: Gap, drawn: dict[str, JudgedRun]) -> Any:
