@@ -12,13 +12,20 @@ compared on the pairs that all of them have. With the estimated and the true pos
     in the world    p - p',  v - v'                     from it    R^T (p - t) - R'^T (p' - t'),  R^T v - R'^T v'
 
 Intervals are paired bootstraps over recordings, the seeds of one taken together, of changes of pooled errors.
+
+Online, each frame adds an epoch to the running graph of the last seconds. The stationarity of objects follows from
+the window, and iSAM2 solves that with the new factors. Epochs older than `lag` leave: they are marginalised with all
+factors on their variables, linearised at the present estimate. On recordings it pays neither for the path nor for the
+objects beside a tracker along LiDAR odometry, so that no command offers it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -27,7 +34,6 @@ import numpy as np
 import typer
 from scipy.spatial.transform import Rotation
 
-from benchmarks.online_joint import OnlineEstimator
 from benchmarks.runner import Row, Rows, each, paired_bootstrap
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.simulator import SimulatorSettings, simulate_scene
@@ -36,26 +42,177 @@ from pipelines.cli.options import Config
 from pipelines.config import TrackConfig, load_config
 from pipelines.slam.lidar_slam import path_tracker
 from saga_fg.errors import InputError
-from saga_fg.graph import EGO_POSE, Additions, GraphView
-from saga_fg.model import PoleLandmark
-from saga_fg.numerics import Assignment, FloatArray, IntArray, assign, inverse_transform, transform_points
+from saga_fg.estimators import GraphSolution, IncrementalSmoother, RelinearisationSettings
+from saga_fg.graph import EGO_POSE, Additions, FactorProvider, Factors, GraphError, GraphView
+from saga_fg.numerics import (
+    Assignment,
+    FloatArray,
+    IntArray,
+    assign,
+    checked_covariances,
+    checked_transform,
+    yaw_transform,
+)
 from saga_fg.slam.joint import (
     JointSettings,
     OdometryIncrements,
     OdometryNoise,
     estimate_jointly,
 )
-from saga_fg.slam.joint.graph import ObjectStates
-from saga_fg.slam.joint.record import KEYFRAME_PERIOD, in_ego
-from saga_fg.slam.mapping import LandmarkObservations
-from saga_fg.types import Annotations, Boxes, Detections, Frame, Observation, Scene
+from saga_fg.slam.joint.association import SlowErrors, stationary_probabilities
+from saga_fg.slam.joint.graph import (
+    JointEstimate,
+    ObjectStates,
+    Record,
+    VehicleAndObjects,
+    error_key,
+    read_estimate,
+    stationary_factors,
+)
+from saga_fg.slam.joint.record import (
+    KEYFRAME_PERIOD,
+    MAX_ITERATIONS,
+    EpochRecorder,
+    RecordedEpoch,
+    in_ego,
+)
+from saga_fg.slam.mapping import Given, pose_key
+from saga_fg.tracking import Tracker
+from saga_fg.types import Annotations, Boxes, Detections, Frame, Scene
+
+_SAME = 1e-3  # probability
+
+
+class StationaryPairs:
+    """Factors of stationary objects for every two epochs, given anew where the probabilities have changed."""
+
+    name = "stationary objects"
+
+    def __init__(self) -> None:
+        self._given: dict[int, tuple[FloatArray, FloatArray]] = {}
+
+    def changed(self, record: Record, stationary: Sequence[FloatArray]) -> Given:
+        """Return the provider of a window, with the probabilities (n,) of the objects of each epoch."""
+        named: dict[Hashable, Factors] = {}
+        given: dict[int, tuple[FloatArray, FloatArray]] = {}
+        for pair, rows in zip(pairwise(stationary), pairwise(record), strict=True):
+            k, before = rows[1].epoch, self._given.get(rows[1].epoch)
+            if before is None or not all(np.allclose(a, b, atol=_SAME) for a, b in zip(before, pair, strict=True)):
+                named[k], before = stationary_factors(rows, pair), pair
+            given[k] = before
+        self._given = given
+        return Given(Additions(named=named), self.name)
+
+
+_THRESHOLD = 0.1  # standard deviations that a variable moves before its factors are linearised anew
+
+
+class OnlineEstimator:
+    """Estimate one frame after the other.
+
+        estimator = OnlineEstimator(Tracker(...), lag=3.0)
+        newest = estimator.step(frame, a_T_b)
+        newest.world_T_ego[-1], newest.objects[-1]
+
+    tracker    a new one, which associates detections
+    lag        s; the window begins at the last epoch that is at least so old
+    settings   of the graph
+    start      first pose (4, 4), by default the identity
+    providers  of factors of your own, asked with each frame after its vehicle and objects are added
+
+    Raises `InputError` for a negative lag, and a first pose that is not rigid.
+    """
+
+    def __init__(
+        self,
+        tracker: Tracker,
+        lag: float,
+        settings: JointSettings | None = None,
+        start: FloatArray | None = None,
+        providers: Sequence[FactorProvider] = (),
+    ) -> None:
+        if not (math.isfinite(lag) and lag >= 0):
+            raise InputError(f"lag: expected a finite number of seconds >= 0, got {lag!r}")
+        self._settings, self._lag = settings or JointSettings(), lag
+        # without a lag of its own: epochs leave here, and elimination in the order of time would cost thrice as much
+        self._smoother = IncrementalSmoother(providers, None, RelinearisationSettings(_THRESHOLD, MAX_ITERATIONS))
+        self._recorder = EpochRecorder(tracker)
+        self._start = np.eye(4) if start is None else checked_transform("start", start)
+        self._slow = SlowErrors.at_start(self._settings)
+        self._pairs, self._stationary = StationaryPairs(), list[FloatArray]()
+        self._record = list[RecordedEpoch]()  # of the window
+        self._solution: GraphSolution | None = None
+
+    def step(
+        self, frame: Frame, a_T_b: FloatArray | None = None, covariance: FloatArray | None = None
+    ) -> JointEstimate:
+        """Add the next frame, after the vehicle moved by a_T_b (4, 4) since the last one by its odometry; its estimate.
+
+        a_T_b: not needed for the first frame; covariance: (6, 6) of it as in `OdometryIncrements`, if the device states
+        one. Raises `InputError` for a motion that is missing or not rigid, a bad covariance, a frame that is not later
+        than the last one, or in world coordinates without a pose.
+        """
+        if not self._record:
+            pose, increment, covariance = self._start, np.eye(4), None
+        elif a_T_b is None:
+            raise InputError("a_T_b: expected the motion since the last frame")
+        else:
+            increment = checked_transform("a_T_b", a_T_b)
+            covariance = None if covariance is None else checked_covariances("covariance", [covariance], 1, 6)[0]
+            pose = self._predicted(frame.timestamp, increment)
+        number = self._record[-1].epoch + 1 if self._record else 0
+        now = self._recorder.add(number, frame, pose, increment, covariance)
+        record = [*self._record, now]
+        self._stationary = self._probabilities(record, [*map(self._pose, self._record), pose])
+        new = VehicleAndObjects(record[-2:], [pose], self._settings, known=len(record[-2:]) - 1)
+        given = self._pairs.changed(record, self._stationary)
+        try:
+            self._smoother.step(now.time, [new, given, *self._smoother.providers], frame)
+        except GraphError:
+            self._pairs = StationaryPairs()  # whose factors are unknown now
+            raise
+        self._record, self._solution = record, self._smoother.solution()
+        newest = self._estimate(1)
+        since = now.time - self._lag
+        gone = sum(one.time <= since for one in record[1:])
+        self._smoother.forget(since=since)
+        self._record, self._stationary = self._record[gone:], self._stationary[gone:]
+        self._slow = newest.slow_errors
+        return newest
+
+    def window(self) -> JointEstimate:
+        """The estimate of all epochs in the window. Raises `InputError` before the first frame."""
+        if not self._record:
+            raise InputError("expected a frame before the estimate is asked for")
+        return self._estimate(len(self._record))
+
+    def _estimate(self, count: int) -> JointEstimate:
+        """The estimate of the newest epochs by the last solution, which has the epochs that left after it, too."""
+        assert self._solution is not None
+        return read_estimate(self._record[-count:], self._solution, self._stationary[-count:])
+
+    def _probabilities(self, record: Sequence[RecordedEpoch], path: Sequence[FloatArray]) -> list[FloatArray]:
+        """For each epoch the probabilities that its objects are stationary, along a path (n, 4, 4)."""
+        return stationary_probabilities(record, np.stack(path), self._slow, self._settings, online=True)
+
+    def _pose(self, epoch: RecordedEpoch) -> FloatArray:
+        pose = self._smoother.state(pose_key(epoch.epoch))
+        assert isinstance(pose, gtsam.Pose3)
+        return pose.matrix()
+
+    def _predicted(self, time: float, a_T_b: FloatArray) -> FloatArray:
+        """The pose (4, 4) after the motion a_T_b, corrected by the estimated errors of the odometry."""
+        last = self._record[-1]
+        scale, bias, course = np.asarray(self._smoother.state(error_key(last.epoch)))
+        step = yaw_transform(yaw=-bias * (time - last.time)) @ a_T_b
+        step[:3, 3] = yaw_transform(yaw=-course)[:3, :3] @ a_T_b[:3, 3] / (1 + scale)
+        return np.asarray(self._pose(last) @ step)
+
 
 SENSOR = "lidar"
 NEAR, SETTLED, MOVING = 2.0, 3, 1.0  # m, of a detection from the object that it is of; frames; m/s
 SAME_TIME = 1e-3  # s, between a frame and its truth
 FIGURES = ("world position, m", "world velocity, m/s", "ego position, m", "ego velocity, m/s")
-GAP, OFFSET, SEEN = 25.0, 9.0, 0.8  # m between poles, and from the path, means; chance that one within reach is seen
-REACH, NOISE = 30.0, 0.1  # m: largest distance at which a pole is seen; standard deviation ahead and to the left
 Pair = tuple[int, str]  # frame, object
 State = tuple[IntArray, FloatArray, FloatArray, Assignment]  # ids, states (n, 4), the vehicle's pose, detections
 At = Callable[[int, Frame, Detections], Mapping[str, State]]
@@ -69,7 +226,6 @@ def joint(
         Path | None, typer.Option("--detections", help="Folder of a detector: Car/, Pedestrian/, Cyclist/.")
     ] = None,
     scenes: Annotated[int, typer.Option("--scenes", min=2, help="Simulated scenes.")] = 10,
-    poles: Annotated[bool, typer.Option("--poles", help="Simulated: once more with poles beside the road.")] = False,
     seeds: Annotated[int, typer.Option("--seeds", min=1, help="Samples of the odometry's errors per recording.")] = 1,
     online: Annotated[bool, typer.Option("--online", help="In a running graph, frame by frame.")] = False,
     lag: Annotated[float, typer.Option("--lag", min=0.0, help="Of the running graph, s.")] = 3.0,
@@ -82,21 +238,19 @@ def joint(
 
     \b
     Examples:
-      python -m benchmarks joint --scenes 10 --poles
+      python -m benchmarks joint --scenes 10
       python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --seeds 10
       python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --online
     """
     if (dataroot is None) != (detections is None):
         raise InputError("expected both --dataroot and --detections, or neither")
-    if poles and (online or dataroot is not None):
-        raise InputError("--poles: expected without --online, with simulated streets only")
     if dataroot is None:
         many = [simulate_scene(street(), seed) for seed in range(scenes)]
     else:
         found = KittiTracking(dataroot, detections, None, True)
         many = [found.scene(name) for name in found.scenes]
     base = load_config("simulated" if dataroot is None else "kitti", config)
-    run = partial(online_run, lag=lag) if online else partial(batch_run, poles=poles)
+    run = partial(online_run, lag=lag) if online else batch_run
     yield from joint_rows(many, range(seeds), partial(run, config=base, settings=JointSettings()))
 
 
@@ -114,7 +268,6 @@ class Outcome:
         self.paths[name], self.figures[column] = np.array([error**2 * poses, poses]), error
 
 
-PATHS = (("joint", "decoupled"), ("with poles", "joint"))
 OBJECTS = (("joint", "decoupled"), ("joint", "held"))
 
 
@@ -131,11 +284,9 @@ def joint_rows(scenes: Sequence[Scene], seeds: Sequence[int], run: Callable[...,
                 about = {"recording": scene.name, "seed": seed, "method": name, "pairs": int(sums[0, 1])}
                 yield "RMSE of moving objects, at every frame", {**about, **rmse}
     known = next(iter(runs.values()))[0]
-    for name, base in PATHS:
-        if name in known.paths:
-            a, b = ([np.sum([o.paths[one] for o in some], axis=0) for some in runs.values()] for one in (name, base))
-            row = {"error": f"{name} against {base}", "change": paired_bootstrap(a, b)}
-            yield "changes of the pooled error of the path", row
+    a, b = ([np.sum([o.paths[one] for o in some], axis=0) for some in runs.values()] for one in ("joint", "decoupled"))
+    row = {"error": "joint against decoupled", "change": paired_bootstrap(a, b)}
+    yield "changes of the pooled error of the path", row
     for name, base in OBJECTS:
         for moving in (True, False) if (base, True) in known.objects else ():
             mine, theirs = (
@@ -190,8 +341,8 @@ def _rotations(vector: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 
-def batch_run(scene: Scene, seed: int, config: TrackConfig, settings: JointSettings, poles: bool = False) -> Outcome:
-    """From the whole recording; with `poles` once more with those beside the road."""
+def batch_run(scene: Scene, seed: int, config: TrackConfig, settings: JointSettings) -> Outcome:
+    """From the whole recording."""
     frames, truth, odometry = degraded_drive(scene, settings, SENSOR, seed)
     outcome, n, driven, tracker = Outcome(), len(frames), odometry.path(truth.world_T_ego[0]), path_tracker(config)
     once, new = replace(settings, passes=1), partial(path_tracker, config)
@@ -207,9 +358,6 @@ def batch_run(scene: Scene, seed: int, config: TrackConfig, settings: JointSetti
     outcome.add_path("joint", "joint", joined.ate, n)
     relative = (one.relative_translation for one in (alone, joined))
     outcome.figures |= dict(zip(("m per 10 m: decoupled", "m per 10 m: joint"), relative, strict=True))
-    if poles:
-        again = solved(settings, driven[0], new_providers=lambda: [poles_at(frames, driven, seed)])
-        outcome.add_path("with poles", "ATE with poles", errors(again.world_T_ego).ate, n)
     held = solved(once, driven[0], new_providers=lambda: [HeldPath(driven)])
 
     def at(k: int, frame: Frame, found: Detections) -> dict[str, State]:
@@ -332,26 +480,3 @@ class HeldPath:
         noise = gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)
         pose = gtsam.Pose3(self.path[view.epoch])
         return Additions(factors=[gtsam.PriorFactorPose3(view.key(EGO_POSE, 0), pose, noise)])
-
-
-def poles_at(frames: Sequence[Frame], path: FloatArray, seed: int) -> LandmarkObservations:
-    """Observations of poles beside the path, 1.5 m high, at frames with true poses; path: (n, 4, 4) by odometry."""
-    poses = np.stack([frame.world_T_ego for frame in frames if frame.world_T_ego is not None])
-    rng, places = np.random.default_rng(seed), []
-    driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
-    for side in (-1.0, 1.0):
-        along = np.arange(0.0, driven[-1] + REACH, GAP)
-        along = along + rng.uniform(-0.3, 0.3, len(along)) * GAP
-        for s in along.tolist():
-            row = min(int(np.searchsorted(driven, s)), len(driven) - 1)
-            ahead, across = s - driven[row], side * (OFFSET + rng.normal(0, 1.0))
-            places.append(transform_points(poses[row], np.array([[ahead, across, 1.5]]))[0])
-    kind, R, start = PoleLandmark(), NOISE**2 * np.eye(2), dict[int, FloatArray]()
-    seen: dict[int, list[tuple[int, Observation]]] = {}
-    for k, pose in enumerate(poses):
-        local = transform_points(inverse_transform(pose), np.stack(places))
-        near = (np.hypot(*local[:, :2].T) <= REACH) & (rng.random(len(local)) < SEEN)
-        local[:, :2] += NOISE * rng.standard_normal((len(local), 2))
-        seen[k] = [(number, Observation(kind, local[number], R)) for number in np.flatnonzero(near).tolist()]
-        start |= {number: kind.initialise(path[k], one.value) for number, one in seen[k] if number not in start}
-    return LandmarkObservations(seen, start)

@@ -1,4 +1,4 @@
-"""False loop closures in pose graphs beside GTSAM's graduated non-convexity, and loops by place on simulated drives.
+"""Loops by place on simulated drives.
 
 A course of some 2 km passes three stretches again (`benchmarks.course`). Its odometry is the true motion with
 errors sampled from `NOISE`, and `drift` m in a random direction more, growing evenly until the vehicle first comes
@@ -8,36 +8,24 @@ if a true loop ends in it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf
-from pathlib import Path
 from typing import Annotated, Any
 
-import gtsam
 import numpy as np
 import typer
 
 from benchmarks.course import SimulatedCourse, revisits
 from benchmarks.joint import degraded_odometry
-from benchmarks.runner import Row, Rows, clocked, each
+from benchmarks.runner import Rows, each
 from data_tools.lidar import Scan
-from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.slam.driver import SlamResult
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
-from saga_fg.errors import InputError, error_context
+from saga_fg.errors import InputError
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, inverse_transform
 from saga_fg.slam.joint import OdometryIncrements, OdometryNoise
-from saga_fg.slam.pose_graph import (
-    PoseGraph,
-    consensus,
-    factor_graph,
-    optimise_poses,
-    pose_array,
-    pose_values,
-    trusted,
-)
 from saga_fg.slam.submaps import LoopClosure
 
 NOISE = OdometryNoise(  # like that of scan registration: headings drift, distances are right
@@ -57,42 +45,20 @@ PERIOD, FALSE, OVER = 0.25, 1.5, 400.0  # s between scans: 2 m at most; m; m of 
 
 
 def loops(
-    files: Annotated[list[Path] | None, typer.Argument(help="Pose graphs in the g2o format.")] = None,
-    shares: Annotated[str, typer.Option("--shares", help="False loops for each true one, with commas.")] = "0.1,0.3,1",
-    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Graphs made for each share.")] = 5,
-    gnc: Annotated[bool, typer.Option("--gnc/--no-gnc", help="Run gtsam.GncLMOptimizer too.")] = True,
-    courses: Annotated[
-        str | None, typer.Option("--courses", help="In place of files: seeds of simulated LiDAR drives, with commas.")
-    ] = None,
+    courses: Annotated[str, typer.Option("--courses", help="Seeds of simulated drives, with commas.")] = "0,1",
     drift: Annotated[
-        str, typer.Option("--drift", help="With --courses: m of drift until the first loop, besides 1 %, with commas.")
+        str, typer.Option("--drift", help="m of drift until the first loop, besides 1 %, with commas.")
     ] = "0,10,30",
 ) -> Rows:
-    """Add false loops to pose graphs, and compare with the optimum without them.
-
-    With --courses: find the loops of drives of 2 km that pass three stretches again, and compare the path with that of
-    the odometry.
+    """Find the loops of drives of 2 km that pass three stretches again, and compare the path with the odometry's.
 
     \b
-    Examples:
-      python -m benchmarks loops data/slam/CSAIL.g2o data/slam/intel.g2o
+    Example:
       python -m benchmarks loops --courses 0,1
     """
-    if bool(files) == (courses is not None):
-        raise InputError("expected either files of pose graphs, or --courses, which are simulated")
-    if courses is not None:
-        drives = [(seed, m) for seed in _numbers("--courses", courses) for m in _numbers("--drift", drift)]
-        for seed, metres in each(drives, "courses"):
-            yield "simulated courses: odometry that errs by 1 %, and loops", course_row(int(seed), metres)
-        return
-    wanted, graphs = _numbers("--shares", shares), {}
-    for file in files or ():
-        graphs[file] = read_g2o(file)
-        with error_context(str(file)):
-            with_false_loops(graphs[file], 0.0, seed=0)  # refuses what cannot have any, before hours of others
-    for file, graph in graphs.items():
-        with error_context(str(file)):
-            yield from _spoilt(file.stem, graph, wanted, seeds, gnc)
+    drives = [(seed, m) for seed in _numbers("--courses", courses) for m in _numbers("--drift", drift)]
+    for seed, metres in each(drives, "courses"):
+        yield "simulated courses: odometry that errs by 1 %, and loops", course_row(int(seed), metres)
 
 
 def _numbers(option: str, text: str) -> list[float]:
@@ -103,27 +69,6 @@ def _numbers(option: str, text: str) -> list[float]:
     if not all(0 <= number < inf for number in numbers):
         raise InputError(f"{option}: expected numbers >= 0 with commas, got {text!r:.40}")
     return numbers
-
-
-def _spoilt(name: str, graph: PoseGraph, shares: Sequence[float], seeds: int, gnc: bool) -> Iterator[Row]:
-    """Distances from the optimum without false loops: RMS over poses, the median and the largest over seeds."""
-    clean, true, d = optimise_poses(graph).world_T_pose, len(graph.first), graph.dim
-
-    def ours(spoilt: PoseGraph) -> tuple[FloatArray, BoolArray]:
-        agreed = consensus(spoilt)
-        return optimise_poses(agreed.graph).world_T_pose, agreed.kept
-
-    for share in shares:
-        for method, solve in (("saga-fg", ours), *((("GTSAM GNC", graduated),) if gnc else ())):
-            off, lost, taken, ms = list[float](), 0, 0, list[float]()
-            for seed in each(range(seeds), f"{name}, {share:g}, {method}"):
-                (poses, kept), spent = clocked(solve, with_false_loops(graph, share, seed))
-                ms.append(spent)
-                off.append(float(np.sqrt(np.mean(np.sum((poses - clean)[:, :d, d] ** 2, axis=1)))))
-                lost, taken = lost + int((~kept[:true]).sum()), taken + int(kept[true:].sum())
-            about = {"graph, share": f"{name}, {share:g}", "method": method, "off, m: median": np.median(off)}
-            counts = {"largest": max(off), "true lost": lost, "false taken": taken, "CPU s": np.mean(ms) / 1e3}
-            yield "false loops: distance from the optimum without them", {**about, **counts}
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,53 +139,3 @@ def odometry_of(course: SimulatedCourse, seed: int, drift: float) -> FloatArray:
     again = course.distance[revisits(course.world_T_ego)[0][0]]
     poses[:, :2, 3] += drift * (course.distance / again)[:, None] * np.array([np.cos(angle), np.sin(angle)])
     return poses
-
-
-def graduated(graph: PoseGraph) -> tuple[FloatArray, BoolArray]:
-    """Poses of `gtsam.GncLMOptimizer` from the guess in the graph, and which measurements (M,) it kept."""
-    params = gtsam.GncLMParams()
-    params.setLossType(gtsam.GncLossType.TLS)
-    params.setKnownInliers([0, *(1 + np.flatnonzero(trusted(graph))).tolist()])
-    optimizer = gtsam.GncLMOptimizer(factor_graph(graph), pose_values(graph.world_T_pose), params)
-    poses = pose_array(optimizer.optimize(), graph.dim)
-    return poses, np.asarray(optimizer.getWeights())[1:] > 0.5
-
-
-_MIN_POSES = 4  # poses, of which two are no neighbours, whichever is first
-_REACH = 10.0  # m, largest coordinate of a false measurement
-
-
-def with_false_loops(graph: PoseGraph, share: float, seed: int) -> PoseGraph:
-    """Append false loops, `share` times as many as the graph has loops, each with the information of one of these.
-
-    Both poses, the position within 10 m by axis, and the rotation are uniformly distributed. Raises `InputError`.
-    """
-    loops = np.flatnonzero(~trusted(graph))
-    if not graph.poses_alone:
-        raise InputError("expected a graph of poses alone, without landmarks and priors")
-    if not len(loops) or len(graph) < _MIN_POSES:
-        raise InputError(f"expected {_MIN_POSES} poses and a loop or more, got {len(graph)} and {len(loops)}")
-    if not 0 <= share < np.inf:
-        raise InputError(f"share: expected a number >= 0, got {share:g}")
-    rng = np.random.default_rng(seed)
-    count, n = round(share * len(loops)), len(graph)
-    first = rng.integers(0, n, count)
-    second = (first + rng.integers(2, n - 1, count)) % n  # neither the same nor a neighbour
-    measured = np.array([_anywhere(rng, graph.dim) for _ in range(count)]).reshape(-1, graph.dim + 1, graph.dim + 1)
-    return replace(
-        graph,
-        first=np.concatenate([graph.first, np.minimum(first, second)]),
-        second=np.concatenate([graph.second, np.maximum(first, second)]),
-        first_T_second=np.concatenate([graph.first_T_second, measured]),
-        information=np.concatenate([graph.information, graph.information[rng.choice(loops, count)]]),
-    )
-
-
-def _anywhere(rng: np.random.Generator, d: int) -> FloatArray:
-    place = rng.uniform(-_REACH, _REACH, d)
-    if d == 2:
-        return np.asarray(gtsam.Pose2(rng.uniform(-np.pi, np.pi), place).matrix())
-    w, x, y, z = rng.normal(size=4)
-    return np.asarray(
-        gtsam.Pose3(gtsam.Rot3.Quaternion(*(np.array([w, x, y, z]) / np.linalg.norm([w, x, y, z]))), place).matrix()
-    )

@@ -2,14 +2,11 @@
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from benchmarks import joint as module
-from benchmarks.app import app
 from benchmarks.course import SimulatedCourse
 from benchmarks.joint import batch_run, degraded_drive, degraded_odometry, joint_rows, online_run, street
 from benchmarks.scans import (
@@ -26,67 +23,19 @@ from benchmarks.scans import street as world_of
 from benchmarks.slam import odometry_rows, scan_to_map_residual
 from data_tools.datasets.kitti import kitti_scans
 from data_tools.lidar import deskewed
-from data_tools.pose_graphs import write_g2o
 from data_tools.simulator import simulate_scene
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.config import load_config
 from saga_fg import InputError
 from saga_fg.numerics.geometry import transform_points, yaw_of, yaw_transform
 from saga_fg.slam.joint import JointSettings, OdometryIncrements, OdometryNoise
-from saga_fg.slam.pose_graph import PoseGraph, PosePriors
 from saga_fg.types.boxes import Boxes
-from tests.saga_fg.loops import loop
-
-
-def spoilt(folder: Path, graph: PoseGraph, *options: str) -> tuple[int, str, str]:
-    sound, _ = loop(2, seed=0)
-    write_g2o(folder / "sound.g2o", sound)
-    write_g2o(folder / "other.g2o", graph)
-    files = [str(folder / name) for name in ("sound.g2o", "other.g2o")]
-    result = CliRunner().invoke(app, ["loops", *files, "--no-gnc", "--seeds", "1", *options])
-    return result.exit_code, result.stdout, result.stderr
-
-
-def test_false_loops_are_left_out(tmp_path):
-    code, stdout, stderr = spoilt(tmp_path, loop(2, seed=1)[0], "--shares", "0.2")
-    assert code == 0, stderr
-    assert "sound, 0.2" in stdout
-    assert "other, 0.2" in stdout
-
-
-def triangle() -> PoseGraph:
-    graph, true = loop(2, seed=0)
-    first, second = np.array([0, 1, 0]), np.array([1, 2, 2])
-    return PoseGraph(
-        graph.ids[:3], true[:3], first, second, np.linalg.inv(true[first]) @ true[second], graph.information[:3]
-    )
-
-
-def with_prior() -> PoseGraph:
-    graph, true = loop(2, seed=0)
-    return replace(graph, priors=PosePriors(np.array([0]), true[:1], np.eye(3)[None]))
-
-
-def test_what_cannot_be_run_is_refused_at_the_door(tmp_path, subtests):
-    for graph, options, message in [
-        (triangle(), [], "other.g2o: expected 4 poses and a loop or more, got 3 and 1"),
-        (with_prior(), [], "other.g2o: expected a graph of poses alone, without landmarks and priors"),
-        (loop(2, seed=1)[0], ["--shares", "-1"], "--shares: expected numbers >= 0 with commas, got '-1'"),
-        (loop(2, seed=1)[0], ["--shares", "inf"], "--shares: expected numbers >= 0 with commas, got 'inf'"),
-    ]:
-        with subtests.test(message):
-            code, stdout, stderr = spoilt(tmp_path, graph, *options)
-            assert code == 2
-            assert message in stderr.replace("\n", " ")
-            assert not stdout
 
 
 def test_courses_that_cannot_be_driven_are_refused(refused, subtests):
     for arguments, message in [
-        ("", "expected either files of pose graphs, or --courses"),
         ("--courses a", "--courses: expected numbers >= 0 with commas, got 'a'"),
         ("--courses 0 --drift -1", "--drift: expected numbers >= 0 with commas"),
-        ("graph.g2o --courses 0", "expected either files of pose graphs, or --courses"),
     ]:
         with subtests.test(message):
             assert message in refused(f"loops {arguments}")
@@ -101,14 +50,14 @@ CONFIG = load_config("simulated")
 def test_recordings_are_pooled_and_the_same_odometry_is_compared():
     scenes = [simulate_scene(SHORT, seed, f"street {seed}") for seed in (1, 2)]
     settings = JointSettings(passes=1)
-    rows = list(joint_rows(scenes, [0], partial(batch_run, config=CONFIG, settings=settings, poles=True)))
+    rows = list(joint_rows(scenes, [0], partial(batch_run, config=CONFIG, settings=settings)))
     paths = [row for title, row in rows if "path, m" in row]
     assert [row["recording"] for row in paths] == ["street 1", "street 2"]
     for scene, row in zip(scenes, paths, strict=True):
         _, truth, odometry = degraded_drive(scene, settings, "lidar", 0)
         alone = Trajectory(truth.timestamps, odometry.path(truth.world_T_ego[0]))
         assert row["ATE, m: decoupled"] == trajectory_errors(alone, truth).ate
-        assert np.isfinite([row["joint"], row["ATE with poles"]]).all()
+        assert np.isfinite(row["joint"])
     change = next(row["change"] for _, row in rows if row.get("error") == "joint against decoupled")
     squares = np.square([(row["joint"], row["ATE, m: decoupled"]) for row in paths]).sum(axis=0)
     assert change.estimate == pytest.approx(np.sqrt(squares[0] / squares[1]) - 1)
@@ -159,7 +108,6 @@ def test_errors_have_the_deviations_of_the_model():
 
 def test_options_go_together_and_one_thing_is_asked_for_at_a_time(refused):
     assert "expected both --dataroot and --detections" in refused("joint --dataroot somewhere")
-    assert "--poles: expected without --online" in refused("joint --online --poles")
     assert "expected one of --dataroot and --dense" in refused("slam --dataroot somewhere --dense 3")
 
 

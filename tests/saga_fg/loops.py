@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 
 from saga_fg.numerics.arrays import FloatArray
-from saga_fg.slam.pose_graph import PoseGraph
+from saga_fg.slam.pose_graph import PoseGraph, trusted
 
 
 def moved(dim: int, tangents: FloatArray) -> FloatArray:
@@ -35,3 +37,34 @@ def loop(dim: int, seed: int, rounds: int = 3, poses: int = 12, noise: float = 0
     guess = moved(dim, 2.0 * rng.normal(size=(n, k)))
     guess[0] = true[0]
     return PoseGraph(np.arange(n) * 10, guess, first, second, measured, information), true
+
+
+REACH = 10.0  # m, largest coordinate of a false measurement
+
+
+def with_false_loops(graph: PoseGraph, share: float, seed: int) -> PoseGraph:
+    """Append false loops, `share` times as many as the graph has loops, each with the information of one of these.
+
+    Both poses, the position within 10 m by axis, and the rotation are uniformly distributed.
+    """
+    loops, n, rng = np.flatnonzero(~trusted(graph)), len(graph), np.random.default_rng(seed)
+    count = round(share * len(loops))
+    first = rng.integers(0, n, count)
+    second = (first + rng.integers(2, n - 1, count)) % n  # neither the same nor a neighbour
+    measured = np.array([_anywhere(rng, graph.dim) for _ in range(count)]).reshape(-1, graph.dim + 1, graph.dim + 1)
+    return replace(
+        graph,
+        first=np.concatenate([graph.first, np.minimum(first, second)]),
+        second=np.concatenate([graph.second, np.maximum(first, second)]),
+        first_T_second=np.concatenate([graph.first_T_second, measured]),
+        information=np.concatenate([graph.information, graph.information[rng.choice(loops, count)]]),
+    )
+
+
+def _anywhere(rng: np.random.Generator, d: int) -> FloatArray:
+    place = rng.uniform(-REACH, REACH, d)
+    if d == 2:
+        return np.asarray(gtsam.Pose2(rng.uniform(-np.pi, np.pi), place).matrix())
+    w, x, y, z = rng.normal(size=4)
+    quaternion = np.array([w, x, y, z]) / np.linalg.norm([w, x, y, z])
+    return np.asarray(gtsam.Pose3(gtsam.Rot3.Quaternion(*quaternion), place).matrix())

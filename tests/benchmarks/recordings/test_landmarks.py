@@ -48,7 +48,8 @@ def park(folder: Path, seed: int = 0) -> tuple[Path, int]:
     return path, len(seen)
 
 
-def test_trees_are_told_apart_without_their_names(bench, tmp_path):
+def test_trees_are_told_apart_without_their_names(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "SCALES", (1.0, 16.0, 256.0))
     path, trees = park(tmp_path)
     evidence, found = bench(f"landmarks {path}")
     assert found["pairwise F1"] > 0.95

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from benchmarks.online_joint import OnlineEstimator
+from benchmarks.joint import OnlineEstimator
 from factors import prior_factor
 from saga_fg import Boxes, Detections, Frame, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.graph import EGO_VELOCITY, Additions, GraphView, NewVariable

@@ -8,7 +8,6 @@ import gtsam
 import numpy as np
 import pytest
 
-from benchmarks.loops import with_false_loops
 from benchmarks.pose_graphs import city, torus
 from data_tools.pose_graphs import read_g2o
 from saga_fg import InputError
@@ -27,6 +26,7 @@ from saga_fg.slam.pose_graph.consensus import chosen_edges
 from saga_fg.slam.pose_graph.optimisation import graph_values
 from saga_fg.slam.submaps import LoopClosure
 from saga_fg.slam.submaps.loops import LoopSelection, _AnchoredLoops, select_loops
+from tests.saga_fg.loops import with_false_loops
 
 PER_LAP, STEPS, EVERY = 100, 200, 5
 STATED = np.array([1e-3] * 3 + [0.03] * 3)
