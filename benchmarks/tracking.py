@@ -14,7 +14,7 @@ import numpy as np
 import typer
 
 from benchmarks.recording_sets import RecordingOptions, RecordingSet, Score, chosen_sets
-from benchmarks.runner import Data, Interval, Row, Rows, clocked, each, paired_bootstrap, resampled
+from benchmarks.runner import Data, Interval, Row, Rows, clocked, each, paired_bootstrap, resampled, square_sums
 from benchmarks.variants import COMPONENTS, SHIPPED, contenders
 from data_tools.metrics import LabelErrors, calibration, error_summary, errors_by_class
 from pipelines.cli.options import Config

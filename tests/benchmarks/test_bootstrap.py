@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.runner import difference, paired_bootstrap, ratio_of_sums
+from benchmarks.runner import difference, paired_bootstrap, ratio_of_sums, square_sums
 from data_tools.metrics import ErrorSample
 from saga_fg.errors import InputError
 
