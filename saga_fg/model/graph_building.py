@@ -26,7 +26,7 @@ construction checks them.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 import scipy.linalg
@@ -221,7 +221,7 @@ _TURNS = np.radians([0.0, 15.0, 45.0, 90.0, 135.0, 180.0])  # between the headin
 _ROUNDING = 1e-6  # 1/s; the double eigenvalue zero of constant velocity is found to half the digits
 _GROWTH = 1e-4  # of an eigenvalue of a step beyond 1, for the same reason
 
-MovingRule = Following | Neighbours | Attached
+MovingRule: TypeAlias = Following | Neighbours | Attached
 
 
 def require_stable(rules: Sequence[EdgeRule], longest_step: float = LONGEST_STEP) -> None:
