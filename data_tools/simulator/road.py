@@ -35,7 +35,7 @@ In a lane that ends the second condition is waived. Gaps of at least s0 / 2 are 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -336,6 +336,8 @@ KINDS = (
     Kind("bus", "bus", (11.8, 2.5, 3.1), (0.7, 0.05, 0.15), speed=0.9, headway=1.15, acceleration=0.7),
 )
 CAR, VAN, TRUCK, BUS = range(4)
+HITCH = 0.9  # m between truck and trailer
+TRAILER_LENGTH = (6.0, 11.0)  # m
 
 
 @dataclass(frozen=True, eq=False)
@@ -390,3 +392,14 @@ def sample_fleet(count: int, desired_speed: float, traffic: TrafficSettings, rng
             spread(COMFORTABLE_DECELERATION),
         ),
     )
+
+
+def attach_trailers(fleet: Fleet, share: float, rng: np.random.Generator) -> tuple[Fleet, FloatArray]:
+    """Attach trailers to a share of the trucks: the fleet with total lengths, and lengths (N,) of trailers, m, or 0."""
+    trailer = np.zeros(len(fleet))
+    if share > 0:
+        tows = (fleet.kind == TRUCK) & (rng.random(len(fleet)) < share)
+        trailer = np.where(tows, rng.uniform(*TRAILER_LENGTH, len(fleet)), 0.0)
+    size = fleet.size.copy()
+    size[:, 0] += np.where(trailer > 0, trailer + HITCH, 0.0)
+    return replace(fleet, size=size), trailer

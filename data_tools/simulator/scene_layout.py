@@ -12,6 +12,7 @@ from data_tools.simulator.road import (
     Fleet,
     Lanes,
     Road,
+    attach_trailers,
     curved_road,
     equilibrium_gap,
     sample_fleet,
@@ -91,6 +92,7 @@ class SceneLayout:
     focus    distance along the road at which traffic is disturbed, m
     hedge    offset of the hedge between the directions, m, or None
     lane, s, speed  (N,) lane, distance along it in m, and speed in m/s of each vehicle
+    trailer  (N,) lengths of the vehicles' trailers, included in their length, m; 0 for none
     """
 
     lanes: Lanes
@@ -102,6 +104,7 @@ class SceneLayout:
     speed: FloatArray
     stop_lines: tuple[ClosingLine, ...]
     slow_zones: tuple[SlowZone, ...]
+    trailer: FloatArray
 
     @property
     def borders(self) -> tuple[float, float]:
@@ -118,7 +121,7 @@ def sample_layout(settings: SimulatorSettings, rng: np.random.Generator) -> Scen
     until = settings.warm_up + settings.duration
     stop_lines, slow_zones = _sample_disturbances(lanes, focus, until, settings.traffic, rng)
     desired_speed = float(rng.uniform(*DESIRED_SPEED))
-    fleet, lane, s = _sample_vehicles(lanes, desired_speed, settings, rng)
+    fleet, trailer, lane, s = _sample_vehicles(lanes, desired_speed, settings, rng)
     speed = np.full(len(fleet), _start_speed(desired_speed))
     return SceneLayout(
         lanes=lanes,
@@ -130,6 +133,7 @@ def sample_layout(settings: SimulatorSettings, rng: np.random.Generator) -> Scen
         speed=speed,
         stop_lines=stop_lines,
         slow_zones=slow_zones,
+        trailer=trailer,
     )
 
 
@@ -193,14 +197,15 @@ def _sample_disturbances(
 
 def _sample_vehicles(
     lanes: Lanes, desired_speed: float, settings: SimulatorSettings, rng: np.random.Generator
-) -> tuple[Fleet, IntArray, FloatArray]:
+) -> tuple[Fleet, FloatArray, IntArray, FloatArray]:
     """Vehicles in platoons at equilibrium gaps on all lanes.
 
-    Returns the fleet, its lanes (N,) and distances s (N,), m.
+    Returns the fleet, the lengths of its trailers (N,), m, its lanes (N,) and distances s (N,), m.
     """
     length = lanes.road.length
     most = int(length / 6.0) * len(lanes.offset)
     fleet = sample_fleet(most, desired_speed, settings.traffic, rng)
+    fleet, trailer = attach_trailers(fleet, settings.traffic.trailer_share, rng)
     gaps = equilibrium_gap(_start_speed(desired_speed), fleet.drivers)
     rows, lane, s, row = [], [], [], 0
     for number in range(len(lanes.offset)):
@@ -216,7 +221,7 @@ def _sample_vehicles(
             s.append(place + fleet.length[row] / 2)
             row, left = row + 1, left - 1
     chosen = np.array(rows)
-    return fleet.select(chosen), np.array(lane), np.array(s)
+    return fleet.select(chosen), trailer[chosen], np.array(lane), np.array(s)
 
 
 _HEDGE_LENGTH = (4.0, 14.0)  # length of a hedge, m

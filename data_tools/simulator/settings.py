@@ -5,6 +5,7 @@ Scenarios:
 traffic      the default settings
 red-light    a queue before a traffic light; frames have a map, the camera reports colours
 road-works   cones close the right lane and move its traffic into the adjacent lane; the map does not have the cones
+towing       many trucks, most of them with a trailer
 two-sensors  a LiDAR with few points on far and small objects, and with outages; cameras that see far ahead
 """
 
@@ -40,6 +41,7 @@ class TrafficSettings(Settings):
 
     truck_share: Fraction = setting(0.18, "share of trucks")
     bus_share: Fraction = setting(0.08, "share of buses")
+    trailer_share: Fraction = setting(0.0, "share of the trucks that tow a trailer")
     platoon_size: PositiveCount = setting((3, 9), "fewest and most vehicles in a platoon")
     platoon_gap: NonNegativeSpan = setting((10.0, 60.0), "extra distance between platoons, m")
     signal_probability: Fraction = setting(0.7, "share of scenes with a traffic light; the others have a slow zone")
@@ -208,7 +210,7 @@ class SimulatorSettings(Settings):
     )
 
 
-ScenarioName = Literal["traffic", "red-light", "road-works", "two-sensors"]
+ScenarioName = Literal["traffic", "red-light", "road-works", "towing", "two-sensors"]
 
 
 _SETTINGS: Mapping[ScenarioName, SimulatorSettings] = {
@@ -226,6 +228,7 @@ _SETTINGS: Mapping[ScenarioName, SimulatorSettings] = {
         roadworks_probability=1.0,
         mapped=True,
     ),
+    "towing": SimulatorSettings(traffic=TrafficSettings(truck_share=0.35, bus_share=0.02, trailer_share=0.8)),
     "two-sensors": SimulatorSettings(
         keyframe_rate=2.0,
         annotation_range=100.0,

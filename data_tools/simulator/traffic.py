@@ -1,4 +1,4 @@
-"""Road users of the simulator: vehicles on lanes, and pedestrians.
+"""Road users of the simulator: vehicles on lanes, trucks with trailers, and pedestrians.
 
 Trajectories of N objects, sampled in time and interpolated between the samples.
 
@@ -24,6 +24,11 @@ lanes, the lane it comes from and the share q of the change it has completed. Ea
 (ballistic update, Treiber and Kesting, Traffic Flow Dynamics, section 11.5), where the acceleration a is what the
 Intelligent Driver Model asked for a reaction time ago, plus random acceleration (an Ornstein-Uhlenbeck process).
 The offset from the centre line follows a smooth step of q, so that a vehicle moves sideways only while it rolls.
+
+Trucks that tow a trailer: one long vehicle in traffic, two objects in the scene.
+
+Both parts follow the path of the combination: along the lane, the truck's centre is (total - truck) / 2 ahead of the
+centre of the combination, the trailer's is (total - trailer) / 2 behind it.
 """
 
 from __future__ import annotations
@@ -35,7 +40,9 @@ import numpy as np
 
 from data_tools.simulator.road import (
     HARDEST_BRAKING,
+    HITCH,
     LaneOrder,
+    Lanes,
     Road,
     best_lane_changes,
     following_acceleration,
@@ -396,3 +403,42 @@ def record_traffic(traffic: Traffic, steps: int) -> TrafficHistory:
         d, slope = traffic.lateral()
         columns.append((traffic.time, traffic.s, traffic.speed, traffic.lane.copy(), d, slope, traffic.on_road))
     return TrafficHistory(*(np.array(column) for column in zip(*columns, strict=True)))
+
+
+def split_trailers(
+    vehicles: SimulatedTrajectories, lanes: Lanes, history: TrafficHistory, trailer: FloatArray
+) -> tuple[SimulatedTrajectories, SimulatedTrajectories]:
+    """The vehicles without their trailers, and the trailers; `trailer` (N,) are their lengths, m, 0 for none."""
+    rows = np.flatnonzero(trailer > 0)
+    if len(rows) == 0:
+        return vehicles, vehicles.select(rows)
+    whole, behind = vehicles.size[rows, 0], trailer[rows]
+    truck = whole - behind - HITCH
+    position, yaw, velocity = (x.copy() for x in (vehicles.position, vehicles.yaw, vehicles.velocity))
+    position[:, rows], yaw[:, rows], velocity[:, rows] = _shifted(lanes, history, rows, (whole - truck) / 2)
+    size = vehicles.size.copy()
+    size[rows, 0] = truck
+    pose = _shifted(lanes, history, rows, -(whole - behind) / 2)
+    trailer_size = np.column_stack([behind, vehicles.size[rows, 1], vehicles.size[rows, 2]])
+    trailers = SimulatedTrajectories(
+        id=np.char.replace(vehicles.id[rows], "vehicle", "trailer"),
+        label=np.full(len(rows), "trailer"),
+        size=trailer_size,
+        time=vehicles.time,
+        position=pose[0],
+        velocity=pose[2],
+        yaw=pose[1],
+        present=vehicles.present[:, rows],
+    )
+    return replace(vehicles, position=position, yaw=yaw, velocity=velocity, size=size), trailers
+
+
+def _shifted(
+    lanes: Lanes, history: TrafficHistory, rows: IntArray, by: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Position (T, k, 2), heading (T, k) and velocity (T, k, 2) of points `by` (k,) m ahead of vehicles' centres."""
+    lane, slope = history.lane[:, rows], history.slope[:, rows]
+    position, heading = lanes.pose(lane, history.s[:, rows] + by, history.offset[:, rows] + slope * by, slope)
+    heading = np.unwrap(heading, axis=0)
+    direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    return position, heading, history.speed[:, rows, None] * direction

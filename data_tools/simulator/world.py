@@ -41,6 +41,7 @@ from data_tools.simulator.traffic import (
     concatenated,
     record_traffic,
     simulate_pedestrians,
+    split_trailers,
     static_objects,
 )
 from saga_fg.errors import InputError
@@ -79,7 +80,7 @@ def build_world(settings: SimulatorSettings, seed: int) -> World:
     streams = np.random.default_rng(seed).spawn(8)
     layout = sample_layout(settings, streams[0])
     history = simulate_traffic(layout, settings, streams[1])
-    vehicles = vehicle_trajectories(layout, history)
+    vehicles, trailers = split_trailers(vehicle_trajectories(layout, history), layout.lanes, history, layout.trailer)
     ego = choose_ego(layout, history, streams[2])
     surrounded = (layout.focus + SURROUNDED[0], layout.focus + SURROUNDED[1])
     around = sample_surroundings(layout, surrounded, settings.parking_probability, streams[3])
@@ -96,7 +97,7 @@ def build_world(settings: SimulatorSettings, seed: int) -> World:
     if settings.mapped:
         road_map = sample_map(layout.lanes, layout.focus, layout.stop_lines, signals, streams[7])
     carrier = vehicles.select(np.array([ego]))
-    objects = concatenated([others, people, parked, cones])
+    objects = concatenated([others, trailers, people, parked, cones])
     ego_pose = partial(pose_on_ground, carrier)
     return World(objects, around.occluders, ego_pose, signals, road_map, carrier, layout, history)
 
@@ -111,7 +112,7 @@ def simulate_traffic(layout: SceneLayout, settings: SimulatorSettings, rng: np.r
 
 
 def vehicle_trajectories(layout: SceneLayout, history: TrafficHistory) -> SimulatedTrajectories:
-    """Motion of the vehicles in world coordinates."""
+    """Motion of the vehicles in world coordinates, a truck and its trailer as one object."""
     position, heading = layout.lanes.pose(history.lane, history.s, history.offset, history.slope)
     direction = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     fleet = layout.fleet

@@ -166,13 +166,13 @@ def test_what_cannot_be_written_is_refused(tmp_path):
 
 
 def test_classes_beyond_vehicles_and_pedestrians_have_their_categories(tmp_path):
-    traffic = TrafficSettings(truck_share=0.7, bus_share=0.0)
+    traffic = TrafficSettings(truck_share=0.7, bus_share=0.0, trailer_share=1.0)
     settings = SimulatorSettings(duration=2.0, warm_up=5.0, traffic=traffic)
     write(tmp_path / "out", SimulatedTraffic(settings, scenes=1))
     folder = tmp_path / "out" / "v1.0-mini"
     categories = {record["token"]: record["name"] for record in json.loads((folder / "category.json").read_text())}
     instances = json.loads((folder / "instance.json").read_text())
-    assert "vehicle.truck" in {categories[record["category_token"]] for record in instances}
+    assert "vehicle.trailer" in {categories[record["category_token"]] for record in instances}
 
 
 META = ResultMeta(use_lidar=True)

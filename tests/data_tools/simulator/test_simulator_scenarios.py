@@ -54,8 +54,10 @@ def queue(
     cars = fleet(count, leader_desires)
     spacing = float(equilibrium_gap(speed, drivers(1))[0]) + KINDS[CAR].size[0]
     s = 1000.0 - spacing * np.arange(count)
-    lane = np.zeros(count, dtype=np.int64)
-    layout = SceneLayout(lanes, 0.0, None, cars, lane, s, np.full(count, speed), tuple(stop_lines), tuple(slow_zones))
+    lane, trailer = np.zeros(count, dtype=np.int64), np.zeros(count)
+    layout = SceneLayout(
+        lanes, 0.0, None, cars, lane, s, np.full(count, speed), tuple(stop_lines), tuple(slow_zones), trailer
+    )
     return Traffic(layout, np.random.default_rng(0), noise=noise, reaction=reaction)
 
 
@@ -122,7 +124,7 @@ def test_reaction_time_and_noise_cause_no_collision(seed):
     assert history.speed.min() >= 0.0
 
 
-# The simulator's scenarios: lights and cones
+# The simulator's scenarios: lights, cones and trailers
 
 SHORT = 6.0  # s
 
@@ -198,3 +200,20 @@ def test_cones_push_the_traffic_of_their_lane_into_the_one_beside():
     cones = here.objects.select(np.flatnonzero(here.objects.label == "traffic_cone"))
     assert len(cones) > 8
     assert (cones.position == cones.position[0]).all()
+
+
+def test_trailers_hang_on_their_trucks():
+    here = world("towing")
+    ids = here.objects.id.tolist()
+    trailers = [k for k, name in enumerate(ids) if name.startswith("trailer")]
+    assert len(trailers) > 5
+    for row in trailers:
+        truck = ids.index(ids[row].replace("trailer", "vehicle"))
+        apart = np.linalg.norm(here.objects.position[:, row] - here.objects.position[:, truck], axis=1)
+        half = (here.objects.size[row, 0] + here.objects.size[truck, 0]) / 2
+        assert here.objects.label[truck] == "truck"
+        assert (np.abs(apart - half - 0.9) < 0.5).all()
+        assert np.allclose(
+            np.linalg.norm(here.objects.velocity[:, row], axis=1),
+            np.linalg.norm(here.objects.velocity[:, truck], axis=1),
+        )
