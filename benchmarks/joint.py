@@ -59,7 +59,6 @@ from saga_fg.slam.joint import (
     OdometryNoise,
     estimate_jointly,
 )
-from saga_fg.slam.joint.association import SlowErrors, stationary_probabilities
 from saga_fg.slam.joint.graph import (
     JointEstimate,
     ObjectStates,
@@ -74,7 +73,9 @@ from saga_fg.slam.joint.record import (
     MAX_ITERATIONS,
     EpochRecorder,
     RecordedEpoch,
+    SlowErrors,
     in_ego,
+    stationary_probabilities,
 )
 from saga_fg.slam.mapping import Given, pose_key
 from saga_fg.tracking import Tracker

@@ -61,8 +61,15 @@ from saga_fg.model.landmarks import PointLandmark
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import gate
 from saga_fg.numerics.geometry import transform_points
-from saga_fg.slam.mapping import LandmarkObservations, LocalMap, MeasuredMotion, associate, landmark_key, pose_key
-from saga_fg.slam.mapping.local_map import log_odds
+from saga_fg.slam.mapping import (
+    LandmarkObservations,
+    LocalMap,
+    MeasuredMotion,
+    associate,
+    landmark_key,
+    log_odds,
+    pose_key,
+)
 from saga_fg.types.frame import Observation
 
 _PATH_SOLVER = SolverSettings(tolerance=1e-2, max_iterations=50)

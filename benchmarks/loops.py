@@ -9,7 +9,6 @@ if a true loop ends in it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from math import inf
 from typing import Annotated, Any
 
@@ -19,7 +18,7 @@ import typer
 from benchmarks.course import SimulatedCourse, revisits
 from benchmarks.joint import degraded_odometry
 from benchmarks.runner import Rows, each
-from data_tools.lidar import Scan
+from benchmarks.scans import GivenPoses
 from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.slam.driver import SlamResult
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
@@ -40,7 +39,7 @@ NOISE = OdometryNoise(  # like that of scan registration: headings drift, distan
     course=1e-3,
     course_drift=1e-5,
 )
-SETTINGS = LidarSlamSettings(landmarks=False, recorded_rotation=2e-3, recorded_translation=0.03)
+SETTINGS = LidarSlamSettings(landmarks=False)
 PERIOD, FALSE, OVER = 0.25, 1.5, 400.0  # s between scans: 2 m at most; m; m of relative errors
 
 
@@ -71,32 +70,11 @@ def _numbers(option: str, text: str) -> list[float]:
     return numbers
 
 
-@dataclass(frozen=True, eq=False)
-class _Drifting:
-    """The scans of a course with the poses of its odometry: a `ScanSequence`."""
-
-    course: SimulatedCourse
-    world_T_ego: FloatArray
-
-    @property
-    def timestamps(self) -> FloatArray:
-        return self.course.timestamps
-
-    @property
-    def ego_T_lidar(self) -> FloatArray:
-        return self.course.ego_T_lidar
-
-    def __len__(self) -> int:
-        return len(self.course)
-
-    def __getitem__(self, row: int) -> Scan:
-        return replace(self.course[row], time=None)  # without skew
-
-
 def drive_course(seed: int, drift: float = 0.0) -> tuple[SimulatedCourse, SlamResult]:
     """Drive the course of a seed."""
     course = SimulatedCourse(seed, period=PERIOD, skewed=False)
-    return course, lidar_slam(_Drifting(course, odometry_of(course, seed, drift)), "recorded", settings=SETTINGS)
+    odometry = GivenPoses(odometry_of(course, seed, drift) @ course.ego_T_lidar, 2e-3, 0.03)
+    return course, lidar_slam(course, odometry=odometry, settings=SETTINGS)
 
 
 def course_row(seed: int, drift: float) -> dict[str, Any]:

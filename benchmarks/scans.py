@@ -30,6 +30,8 @@ from data_tools.datasets.mcap.ros2_types import definition, header
 from data_tools.files import write_text
 from data_tools.laser import LaserLog
 from data_tools.lidar import Scan, ScanSequence, constant_velocity
+from pipelines.slam.odometry import OdometrySettings, OdometryStep, moved_on
+from saga_fg import Boxes
 from saga_fg.numerics import (
     BoolArray,
     FloatArray,
@@ -40,7 +42,25 @@ from saga_fg.numerics import (
     wrap_angle,
     yaw_transform,
 )
-from saga_fg.types import Boxes
+
+
+class GivenPoses:
+    """An odometry of poses (K, 4, 4) of the sensor that are known, with deviations of a step, rad and m.
+
+    Scans that it places have no skew.
+    """
+
+    def __init__(self, poses: FloatArray, rotation: float, translation: float) -> None:
+        self._poses = inverse_transform(poses[0]) @ poses
+        self._noise, self._row, self._keyframe = np.diag([rotation] * 3 + [translation] * 3) ** 2, 0, 0
+
+    def step(self, scan: Scan, timestamp: float, velocity: FloatArray | None = None) -> OdometryStep:
+        """Place the next scan."""
+        k, placed = self._row, self._poses[self._row]
+        keyframe = k == 0 or moved_on(inverse_transform(self._poses[self._keyframe]) @ placed)
+        self._row, self._keyframe = k + 1, k if keyframe else self._keyframe
+        near = scan.within(OdometrySettings().min_range, OdometrySettings().max_range)
+        return OdometryStep(timestamp, placed, self._noise if k else np.zeros((6, 6)), near, keyframe, None)
 
 
 @dataclass(frozen=True, eq=False)

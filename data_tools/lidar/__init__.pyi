@@ -1,6 +1,5 @@
 from .landmarks import Ground, Plane, Pole, extract_poles, extract_walls, fit_plane, segment_ground
 from .places import PlaceImage, PlaceIndex, PlaceMatch, Structure, Submap, upright
-from .recording import PERIOD, RecordingOptions, ScanRecording, scan_context
 from .registration import (
     Observability,
     Registration,
@@ -13,7 +12,10 @@ from .registration import (
     surfels_of,
 )
 from .scan import (
+    PERIOD,
+    RecordingOptions,
     Scan,
+    ScanRecording,
     ScanSequence,
     azimuth_times,
     clusters_from_above,
@@ -21,6 +23,7 @@ from .scan import (
     deskewed,
     inside_boxes,
     load_open3d,
+    scan_context,
     voxel_downsample,
     voxel_keys,
     without_objects,

@@ -40,7 +40,8 @@ from numpy.typing import NDArray
 
 from data_tools.files import isolated, load_archive, load_array, open_bytes, read_bytes, write_bytes
 from data_tools.lidar.scan import Scan, load_open3d
-from saga_fg.errors import InputError, MissingExtraError, error_context
+from saga_fg import InputError, MissingExtraError
+from saga_fg.errors import error_context
 from saga_fg.numerics import BoolArray, FloatArray, checked
 
 Columns = Mapping[str, NDArray[Any]]
@@ -167,9 +168,12 @@ _FEW = 100  # points
 def columns_of_records(content: bytes) -> Columns:
     """The columns of records of which nothing is known. Raises `InputError` where no layout gives a scan.
 
-    So few points that statistics tell nothing are taken for KITTI's, where their size allows it.
+    Points that tell nothing, as they are too few or all without a place, are taken for KITTI's, where their size allows
+    it.
     """
-    if len(content) < _FEW * KITTI.itemsize and len(content) % KITTI.itemsize == 0:
+    fits = len(content) % KITTI.itemsize == 0
+    few = len(content) < _FEW * KITTI.itemsize
+    if fits and (few or np.isnan(np.frombuffer(content, dtype="<f4").reshape(-1, 4)[:, :3]).all()):
         return record_columns(content, KITTI)
     for kind in _FLOATS:
         found: dict[int, float] = {}

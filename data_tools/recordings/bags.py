@@ -28,7 +28,8 @@ from data_tools.datasets.mcap.transforms import TRANSFORM_TYPES, TransformRecord
 from data_tools.files import isolated
 from data_tools.laser.carmen import LaserLog, padded
 from data_tools.lidar import Columns, RecordingOptions, ScanRecording, scan_columns, scan_of_columns
-from saga_fg.errors import InputError, error_context, unknown_name
+from saga_fg import InputError
+from saga_fg.errors import error_context, unknown_name
 from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.slam.sensors import SensorName
 

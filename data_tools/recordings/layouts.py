@@ -18,7 +18,7 @@ import numpy as np
 
 from data_tools.datasets.kitti import KittiTracking, kitti_scans
 from data_tools.datasets.kitti.dataset import read_origin, read_transform
-from data_tools.datasets.nuscenes.dataset import nuscenes_scans
+from data_tools.datasets.nuscenes import nuscenes_scans
 from data_tools.datasets.nuscenes.tables import read_table, table_folder
 from data_tools.files import read_lines
 from data_tools.files import read_table as read_rows
@@ -35,7 +35,8 @@ from data_tools.lidar import (
 from data_tools.recordings.bags import is_bag, open_bag
 from data_tools.sensor_logs import kitti_sensor_log
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
-from saga_fg.errors import InputError, error_context, unknown_name
+from saga_fg import InputError
+from saga_fg.errors import error_context, unknown_name
 from saga_fg.numerics import FloatArray, inverse_transform, quaternion_rotation
 from saga_fg.parts import find
 from saga_fg.providers.vehicle_sensors import mounting
@@ -282,12 +283,10 @@ def kitti_tracking(source: Path, options: RecordingOptions) -> ScanRecording:
     axis and 0.05 m/s. Source: https://www.cvlibs.net/datasets/kitti (development kit of tracking).
     """
     root = source / "training" if (source / "training").is_dir() else source
-    blind = options.blind and not (root / "velodyne" / str(options.sequence)).is_dir()
-    there = (root / "oxts").glob("*.txt") if blind else (root / "velodyne").glob("*")
-    name = _one_of("sequence", options.sequence, (path.stem for path in there))
+    name = _one_of("sequence", options.sequence, (path.stem for path in (root / "velodyne").glob("*")))
     records = root / "oxts" / f"{name}.txt"
     return replace(
-        kitti_scans(source, name, blind=blind),
+        kitti_scans(source, name),
         origin=read_origin(records),
         sensors=lambda: kitti_sensor_log(records, ("imu", "wheels", "gps"), options.seed).tables,
         objects=lambda folder: (

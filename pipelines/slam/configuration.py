@@ -14,11 +14,11 @@ from data_tools.recordings import ScanRecording
 from data_tools.sensor_logs import SensorLog, plausible_inertial, read_sensor_log
 from pipelines.config import TrackConfig, load_config
 from pipelines.configuration import load_settings
-from pipelines.slam.laser_odometry import LaserSettings
+from pipelines.slam.drive import Origin
+from pipelines.slam.laser_slam import LaserSettings
 from pipelines.slam.lidar_slam import LidarSlamSettings
 from pipelines.slam.localisation import LocaliserSettings
-from pipelines.slam.submaps import Origin
-from saga_fg.errors import InputError
+from saga_fg import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.model import LandmarkDetector
 from saga_fg.numerics import FloatArray
@@ -63,12 +63,6 @@ class SlamConfig(TrackConfig):
             raise InputError("tracker.providers: expected under slam, for a graph of vehicle and objects")
 
 
-def load_laser_settings(path: Path | None = None) -> LaserSettings:
-    """Settings of planar laser SLAM, with the overrides of a YAML file. Raises `InputError` naming file and key."""
-    start = SlamConfig()
-    return (start if path is None else load_settings(SlamConfig, path, start)).slam.laser
-
-
 def load_slam_config(family: str | Path, path: Path | None = None) -> SlamConfig:
     """Return the defaults shipped for a kind of data, with the overrides of a YAML file.
 
@@ -102,9 +96,8 @@ def sensor_log(
         raise InputError(f"--sensor-log: expected SENSOR=FILE, such as imu=imu.csv, got {unfinished[0][:40]!r}")
     known = get_args(SensorName)
     for option, names in (("--sensors", named), ("--sensor-log", [name for name, _, _ in given])):
-        for name in names:
-            if name not in known:
-                raise InputError(f"{option}: expected some of {', '.join(known)}, got {name[:40]!r}")
+        if unknown := [name for name in names if name not in known]:
+            raise InputError(f"{option}: expected some of {', '.join(known)}, got {unknown[0][:40]!r}")
     twice = [name for name in known if (*named, *(name for name, _, _ in given)).count(name) > 1]
     if twice:
         raise InputError(f"{twice[0]}: expected either --sensors or --sensor-log, once")

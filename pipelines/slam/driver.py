@@ -32,19 +32,17 @@ from scipy.special import ndtr
 
 from data_tools.lidar import Scan, Submap, inside_boxes, voxel_downsample, without_objects
 from data_tools.trajectories import Trajectory
-from pipelines.slam.drive import Drive, moved_pose
+from pipelines.slam.drive import Drive, SubmapBuilder, moved_pose, world_T_submap
 from pipelines.slam.loop_closures import ClosedSubmaps, LoopSearch
 from pipelines.slam.odometry import Odometry, OdometryStep
-from pipelines.slam.submaps import SubmapBuilder, world_T_submap
 from pipelines.slam.vehicle_sensors import Vehicle, VehicleSensors
-from saga_fg.errors import InputError
+from saga_fg import InputError, Tracker
 from saga_fg.graph import FactorProvider
 from saga_fg.numerics import FloatArray, IntArray, checked_transform
 from saga_fg.slam.joint import JointEstimate
 from saga_fg.slam.mapping import AssociatedObservation
 from saga_fg.slam.pose_graph import PoseGraph, PosePriors
 from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph, SubmapSettings
-from saga_fg.tracking import Tracker
 from saga_fg.types import (
     Boxes,
     Detections,

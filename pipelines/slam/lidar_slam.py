@@ -1,8 +1,7 @@
 """SLAM with a LiDAR: the front end of `pipelines.slam.driver` for it, and whole recordings, with objects too.
 
 Scans are registered with the surfels of those before; walls and poles are observed at keyframes; submaps that
-look alike from above are proved by registration. Odometry is that of the LiDAR, or the recording's own poses, for
-comparison and for objects alone.
+look alike from above are proved by registration.
 
 LiDAR SLAM with objects: the vehicle, walls, poles, loops and the objects of a detector, in one graph.
 
@@ -15,7 +14,6 @@ its frame. The vehicle's sensors measure between moments, so their factors are m
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 
@@ -23,13 +21,13 @@ from data_tools.lidar import ScanSequence, extract_poles, extract_walls, scan_co
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
+from pipelines.slam.drive import world_T_submap
 from pipelines.slam.driver import FrontEnd, MovingObjects, Slam, SlamResult
 from pipelines.slam.loop_closures import LoopSearch, LoopSettings, PlaceLoops
-from pipelines.slam.odometry import LidarOdometry, Odometry, OdometrySettings, RecordedOdometry
-from pipelines.slam.submaps import CloudFormat, world_T_submap
+from pipelines.slam.odometry import LidarOdometry, Odometry, OdometrySettings
 from pipelines.slam.vehicle_sensors import Vehicle, start_by_fixes
 from pipelines.tracking import Progress
-from saga_fg.errors import InputError
+from saga_fg import InputError, Tracker
 from saga_fg.graph import FactorProvider
 from saga_fg.model import LandmarkDetector, PlaneLandmark, PoleLandmark
 from saga_fg.numerics import FloatArray, inverse_transform
@@ -39,42 +37,32 @@ from saga_fg.slam.joint.record import KEYFRAME_PERIOD, in_ego
 from saga_fg.slam.mapping import LandmarkObservations
 from saga_fg.slam.sensors import sensor_providers
 from saga_fg.slam.submaps import Loops, SubmapSettings
-from saga_fg.tracking import Tracker
 from saga_fg.types import Frame, Observation
 
 WALL = PlaneLandmark(name="wall")
 POLE = PoleLandmark()
 
 
-@dataclass(frozen=True)
-class ScanLandmarkSettings:
-    """Settings of the detection of landmarks in a scan."""
-
-    walls: int = setting(6, "largest number of walls of a scan; the largest ones are kept")
-    poles: int = setting(12, "largest number of poles of a scan; the nearest ones are kept")
+_WALLS, _POLES = 6, 12  # of a scan: the largest walls and the nearest poles are kept
 
 
-def observe_landmarks(
-    points: FloatArray, settings: ScanLandmarkSettings | None = None, detectors: Sequence[LandmarkDetector] = ()
-) -> list[Observation]:
+def observe_landmarks(points: FloatArray, detectors: Sequence[LandmarkDetector] = ()) -> list[Observation]:
     """Observe landmarks in points (N, 3) of a scan without skew, m, in the sensor's frame.
 
     detectors: of further kinds of landmarks
     """
-    s = settings or ScanLandmarkSettings()
     ground = segment_ground(points)
     found: list[Observation] = []
     walls = extract_walls(points[~ground.is_ground])
-    for wall in walls[: s.walls]:
+    for wall in walls[:_WALLS]:
         found.append(Observation(WALL, wall.coefficients, wall.covariance, wall.extent))
     poles = extract_poles(points, ground.height, walls)
-    for pole in sorted(poles, key=lambda pole: float(np.hypot(*pole.foot[:2])))[: s.poles]:
+    for pole in sorted(poles, key=lambda pole: float(np.hypot(*pole.foot[:2])))[:_POLES]:
         extent = np.stack([pole.foot, [*pole.foot[:2], pole.top]])
         found.append(Observation(POLE, pole.foot, pole.covariance, extent))
     return found + [other for detector in detectors for other in detector.observations(points)]
 
 
-OdometrySource = Literal["lidar", "recorded"]
 # slow errors of an odometry that has hardly any; what else it does is in its covariances
 CALIBRATED = OdometryNoise(
     turn_noise=1e-3,
@@ -93,7 +81,6 @@ class LidarSlamSettings(Settings):
     """Settings of LiDAR SLAM."""
 
     odometry: OdometrySettings = settings_group(OdometrySettings, "LiDAR odometry")
-    observations: ScanLandmarkSettings = settings_group(ScanLandmarkSettings, "detection of landmarks in a scan")
     submaps: SubmapSettings = settings_group(SubmapSettings, "submaps and their landmarks")
     loops: LoopSettings = settings_group(LoopSettings, "loop closures by place")
     landmarks: bool = setting(True, "use landmarks as nodes of the graph")
@@ -101,16 +88,7 @@ class LidarSlamSettings(Settings):
     map_spacing: Positive = setting(
         0.25, "spacing of the points of the map, its submaps and map.ply, m; higher: less memory, smaller files"
     )
-    map_format: CloudFormat = setting("ply", "format of the files of the map's submaps: ply or pcd")
     objects: JointSettings = settings_group(lambda: JointSettings(odometry=CALIBRATED), "objects in the same graph")
-    recorded_rotation: Positive = setting(
-        2e-4, "standard deviation of the rotation of a GPS/IMU increment between scans, rad; usual 1e-4 to 1e-3"
-    )
-    recorded_translation: Positive = setting(
-        0.005,
-        "standard deviation of the translation of a GPS/IMU increment between scans, m; accuracy of the velocity that "
-        "the records state (KITTI: 0.01 to 0.05 m/s) times the period; higher: landmarks and objects move the path",
-    )
 
 
 class LidarSlam(Slam):
@@ -138,7 +116,7 @@ class LidarSlam(Slam):
         by_place = PlaceLoops(s.loops) if loops is None and s.loop_closures else loops
 
         def observe(points: FloatArray) -> list[Observation]:
-            return observe_landmarks(points, s.observations, detectors) if s.landmarks else []
+            return observe_landmarks(points, detectors) if s.landmarks else []
 
         front_end = FrontEnd(odometry or LidarOdometry(s.odometry), s.submaps, s.map_spacing, by_place, observe)
         super().__init__(front_end, start, providers, moving, vehicle)
@@ -146,29 +124,24 @@ class LidarSlam(Slam):
 
 def lidar_slam(
     scans: ScanSequence,
-    source: OdometrySource = "lidar",
     *,
     settings: LidarSlamSettings | None = None,
     progress: Progress | None = None,
     providers: Sequence[FactorProvider] = (),
     detectors: Sequence[LandmarkDetector] = (),
+    odometry: Odometry | None = None,
     log: SensorLog | None = None,
     objects: tuple[Sequence[Frame], Tracker] | None = None,
 ) -> SlamResult:
     """Estimate everything from K >= 2 scans of a recording, one after the other. The only pose of the recording that
-    counts is the first, unless the source is "recorded". Without poses the world is the vehicle's frame at the first
+    counts is the first. Without poses the world is the vehicle's frame at the first
     scan, or that of the fixes by GPS, if there are any: the first scans then tell which way it looks.
 
-    providers, detectors: as of `LidarSlam`; log: of the vehicle's sensors, in the recording's world; objects: frames
-    with detections at the times of all scans, and a new tracker: moving objects leave the scans.
+    providers, detectors, odometry: as of `LidarSlam`; log: of the vehicle's sensors, in the recording's world; objects:
+    frames with detections at the times of all scans, and a new tracker: moving objects leave the scans.
     Raises `InputError` for a scan without a frame.
     """
     s = settings or LidarSlamSettings()
-    recorded = (
-        RecordedOdometry(scans, s.recorded_rotation, s.recorded_translation, s.odometry)
-        if source == "recorded"
-        else None
-    )
     log = log or SensorLog({})
     start: FloatArray | tuple[FloatArray, FloatArray] = scans.ego_T_lidar
     if scans.world_T_ego is not None:
@@ -183,7 +156,7 @@ def lidar_slam(
         s,
         providers=providers,
         detectors=detectors,
-        odometry=recorded,
+        odometry=odometry,
         moving=None if objects is None else MovingObjects(objects[1]),
         vehicle=Vehicle(scans.ego_T_lidar, tuple(log.tables), log.settings),
     )

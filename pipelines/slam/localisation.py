@@ -39,13 +39,13 @@ from data_tools.lidar import (
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from factors import Robust, pose_prior_factor
-from pipelines.slam.drive import Drive, moved_pose
+from pipelines.slam.drive import Drive, SlamMap, moved_pose, placed_clouds
 from pipelines.slam.loop_closures import COMPARED, FEWEST, SURFEL, agreeing, fits_otherwise, registered
 from pipelines.slam.odometry import LOST_TRANSLATION, LidarOdometry, OdometrySettings
-from pipelines.slam.submaps import SlamMap, placed_clouds
 from pipelines.slam.vehicle_sensors import Vehicle, VehicleSensors
 from pipelines.tracking import Progress
-from saga_fg.errors import InputError, require_type
+from saga_fg import InputError
+from saga_fg.errors import require_type
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_POSE, Additions, FactorProvider
 from saga_fg.numerics import (
@@ -58,7 +58,6 @@ from saga_fg.numerics import (
 )
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group
 from saga_fg.slam.mapping import Given, MeasuredMotion, pose_key
-from saga_fg.slam.sensors import SensorConsistency
 from saga_fg.types import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 
 _REGISTERED = 6  # places for each search
@@ -181,6 +180,22 @@ class LocalisedStep:
     registered: bool
 
 
+@dataclass(frozen=True, eq=False)
+class LocalisedDrive:
+    """Poses (K) of the vehicle in the map, and whether each scan (K,) was registered with it.
+
+    covariances (K, 6, 6) of the sensor's poses, (rotation, translation) in its frame, rad^2, m^2
+    misfits   what does not fit of the vehicle's sensors, in words, by their names
+    unjudged  sensors that have measured too little to tell, likewise
+    """
+
+    trajectory: Trajectory
+    covariances: FloatArray
+    registered: BoolArray
+    misfits: Mapping[str, str]
+    unjudged: Mapping[str, str]
+
+
 class Localiser:
     """Takes the scans of a drive in order of time, and says where they are in a map.
 
@@ -202,6 +217,7 @@ class Localiser:
         self._guess = None if guess is None else checked_transform("guess", guess)
         self._sensors = VehicleSensors(vehicle or Vehicle())
         self._measured, self._of_sensors = self._sensors.since_keyframe, self._sensors.new_providers()
+        self._consistency = self._sensors.consistency
         self._fix: tuple[float, float, FloatArray] | None = None  # the newest: its time, s, the way then, m, its place
         self._map = KnownMap(slam_map)
         self._path = Drive()
@@ -262,26 +278,6 @@ class Localiser:
         rows = sorted(self._found)
         return self._path.carried(np.array([self._found[row][0] for row in rows]), rows)
 
-    def covariances(self) -> FloatArray | None:
-        """Covariances (K, 6, 6) of the tangents of the poses of `path`, rad^2, m^2; None if no place has been found."""
-        if not self._found:
-            return None
-        known, found = np.array(sorted(self._found)), list[FloatArray]()
-        of = known[np.maximum(np.searchsorted(known, np.arange(len(self._path)), side="right") - 1, 0)].tolist()
-        for row, keyframe in enumerate(of):
-            pose, covariance = self._found[keyframe]
-            if row >= keyframe:
-                found.append(moved_pose(pose, covariance, self._path.moved(keyframe, row))[1])
-            else:
-                ahead, noise = self._path.moved(row, keyframe)
-                found.append(carried_covariance(ahead, covariance + noise))
-        return np.array(found)
-
-    @property
-    def registered(self) -> BoolArray:
-        """Mask (K,) of the scans so far that were registered with the map, without those withdrawn since."""
-        return np.isin(np.arange(len(self._path.poses)), sorted(self._fits))
-
     @property
     def way(self) -> float:
         """Way by odometry, m."""
@@ -292,23 +288,39 @@ class Localiser:
         """True if the last cloud searched for fits several places of the map."""
         return self._map.ambiguous
 
-    @property
-    def consistency(self) -> SensorConsistency:
-        """Whether the sensors of the vehicle fit the path in the map, also in the warnings of `finish`."""
-        return self._sensors.consistency
+    def finish(self) -> LocalisedDrive | None:
+        """After the last scan: look for the place with the points there are, or compare the last ones with the map.
 
-    def finish(self) -> None:
-        """After the last scan: look for the place with the points there are, or compare the last ones with the map."""
+        None if no place has been found.
+        """
         if self._finished:
             raise InputError("finish: expected to be called once")
         self._finished = True
         if self._smoother is not None:
-            self.consistency.observe(self._smoother.graph())
+            self._consistency.observe(self._smoother.graph())
             self._compare()
         if self._smoother is None and self._clouds and self.way > self._searched:
             self._search(*self._clouds[-1], self._time)
-        if self._found:
-            self.consistency.warn()
+        if (path := self.path()) is None:
+            return None
+        self._consistency.warn()
+        trajectory = Trajectory(np.array(self._path.times), path @ self._sensors.lidar_T_ego)
+        registered = np.isin(np.arange(len(path)), sorted(self._fits))
+        fit = self._consistency
+        return LocalisedDrive(trajectory, self._covariances(), registered, fit.misfits, fit.unjudged)
+
+    def _covariances(self) -> FloatArray:
+        """Covariances (K, 6, 6) of the tangents of the poses of `path`, rad^2, m^2."""
+        known, found = np.array(sorted(self._found)), list[FloatArray]()
+        of = known[np.maximum(np.searchsorted(known, np.arange(len(self._path)), side="right") - 1, 0)].tolist()
+        for row, keyframe in enumerate(of):
+            pose, covariance = self._found[keyframe]
+            if row >= keyframe:
+                found.append(moved_pose(pose, covariance, self._path.moved(keyframe, row))[1])
+            else:
+                ahead, noise = self._path.moved(row, keyframe)
+                found.append(carried_covariance(ahead, covariance + noise))
+        return np.array(found)
 
     def _look_for(self, row: int, points: FloatArray, time: float) -> None:
         """Begin the graph where the guess says, or at a place that the points since the last search resemble."""
@@ -373,7 +385,7 @@ class Localiser:
     def _give_up(self, why: str) -> None:
         _LOG.warning("at %.1f m: %s; the place is looked for", self.way, why)
         if self._unproved:
-            self.consistency.forget(self._path.times[self._unproved[0]])
+            self._consistency.forget(self._path.times[self._unproved[0]])
         for row in self._unproved:
             self._found.pop(row, None)
             self._fits.discard(row)
@@ -403,7 +415,7 @@ class Localiser:
             self._fits.add(row)
         self._smoother.step(time, [*given, *self._of_sensors], self._measured.frame(time, None))
         self._sensors.begin(self._smoother)
-        self.consistency.observe(self._smoother.graph(), s.lag / 2)
+        self._consistency.observe(self._smoother.graph(), s.lag / 2)
         (pose,) = self._smoother.graph().of(EGO_POSE, self._smoother.graph().epoch).values()
         self._pose, self._covariance = (
             self._smoother.graph().state(pose.key).matrix(),
@@ -418,22 +430,6 @@ class Localiser:
             self._clouds = [one for one in self._clouds if self.way - self._path.ways[one[0]] <= _WINDOW]
             self._compare()
         return found is not None
-
-
-@dataclass(frozen=True, eq=False)
-class LocalisedDrive:
-    """Poses (K) of the vehicle in the map, and whether each scan (K,) was registered with it.
-
-    covariances (K, 6, 6) of the sensor's poses, (rotation, translation) in its frame, rad^2, m^2
-    misfits   what does not fit of the vehicle's sensors, in words, by their names
-    unjudged  sensors that have measured too little to tell, likewise
-    """
-
-    trajectory: Trajectory
-    covariances: FloatArray
-    registered: BoolArray
-    misfits: Mapping[str, str]
-    unjudged: Mapping[str, str]
 
 
 def localise(
@@ -459,9 +455,8 @@ def localise(
             localiser.step(scans[k], time, ego.imu, ego.gps, ego.wheels)
         if progress is not None:
             progress("localising", k + 1, len(scans))
-    localiser.finish()
-    path, covariances, registered = localiser.path(), localiser.covariances(), localiser.registered
-    if path is None or covariances is None or not registered.any():
+    found = localiser.finish()
+    if found is None or not found.registered.any():
         if localiser.ambiguous:
             raise InputError(
                 "map: expected one that shows the place of this drive once, it is ambiguous: several places of the map "
@@ -474,6 +469,4 @@ def localise(
             f"map: expected one that shows a place of this drive, {where} in {localiser.way:.0f} m of way; a longer "
             "drive, or a guess good to a metre or two and 0.1 rad, may help"
         )
-    trajectory = Trajectory(scans.timestamps, path @ inverse_transform(scans.ego_T_lidar))
-    fit = localiser.consistency
-    return LocalisedDrive(trajectory, covariances, registered, fit.misfits, fit.unjudged)
+    return found

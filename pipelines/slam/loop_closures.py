@@ -49,11 +49,10 @@ from data_tools.lidar import (
     register,
     voxel_downsample,
 )
-from pipelines.slam.drive import LEAST
-from pipelines.slam.submaps import SubmapBuilder, world_T_submap
+from pipelines.slam.drive import LEAST, SubmapBuilder, world_T_submap
 from saga_fg.numerics import FloatArray, IntArray, carried_covariance, inverse_transform
 from saga_fg.settings import Fraction, Positive, Settings, setting
-from saga_fg.slam.pose_graph.consensus import shortest_paths
+from saga_fg.slam.pose_graph.optimisation import shortest_paths
 from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph
 
 

@@ -19,7 +19,6 @@ al., KISS-ICP, RA-L 2023; planes in place of points need fewer of them, and give
 """
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -32,7 +31,6 @@ from data_tools.lidar import (
     Registration,
     RegistrationError,
     Scan,
-    ScanSequence,
     Structure,
     SurfelMap,
     constant_velocity,
@@ -42,15 +40,9 @@ from data_tools.lidar import (
     voxel_downsample,
 )
 from data_tools.trajectories import rotation_angle
-from saga_fg.errors import InputError
-from saga_fg.numerics import (
-    FloatArray,
-    checked,
-    checked_transform,
-    inverse_transform,
-    transform_points,
-    yaw_transform,
-)
+from saga_fg import InputError
+from saga_fg.errors import require_type
+from saga_fg.numerics import FloatArray, checked, checked_transform, inverse_transform, transform_points, yaw_transform
 from saga_fg.settings import Positive, Settings, setting
 
 _FIRST_DEVIATION = 1.0  # standard deviation of the first motion, m
@@ -382,10 +374,9 @@ def _components(velocity: FloatArray) -> str:
 
 def checked_step(step: object) -> OdometryStep:
     """The step of an odometry, as it is; raises `InputError` for what is no pose, covariance or scan."""
-    if not isinstance(step, OdometryStep):
-        raise InputError(f"odometry: expected an OdometryStep, got {type(step).__name__}")
-    if not isinstance(step.scan, Scan):
-        raise InputError(f"odometry: scan: expected a Scan, got {type(step.scan).__name__}")
+    require_type("odometry", step, OdometryStep)
+    assert isinstance(step, OdometryStep)
+    require_type("odometry: scan", step.scan, Scan)
     if not (isinstance(step.lost, int) and step.lost >= 0):
         raise InputError(f"odometry: lost: expected a number of scans, got {step.lost!r}")
     checked_transform("odometry: map_T_lidar", step.map_T_lidar)
@@ -401,37 +392,3 @@ class Odometry(Protocol):
 
     def step(self, scan: Scan, timestamp: float, velocity: FloatArray | None = None) -> OdometryStep:
         """Place the next scan; velocity: by other sensors, as of `LidarOdometry.step`."""
-
-
-class RecordedOdometry:
-    """The poses of a recording as odometry, with deviations of `rotation`, rad, and `translation`, m, a scan."""
-
-    def __init__(self, scans: ScanSequence, rotation: float, translation: float, settings: OdometrySettings) -> None:
-        if scans.world_T_ego is None:
-            raise InputError("odometry: expected poses in the recording, it has none")
-        self._poses, self._times, self._settings = scans.world_T_ego @ scans.ego_T_lidar, scans.timestamps, settings
-        self._noise = np.diag([rotation] * 3 + [translation] * 3) ** 2
-        self._row, self._keyframe = -1, 0
-
-    def step(self, scan: Scan, timestamp: float, velocity: FloatArray | None = None) -> OdometryStep:
-        """Place the next scan of the recording; raises `InputError` for one of another time."""
-        k, s = self._row + 1, self._settings
-        if k == len(self._times) or timestamp != self._times[k]:
-            raise InputError(f"timestamp: expected that of scan {k} of the recording, got {timestamp:.6f} s")
-        moved = inverse_transform(self._poses[self._keyframe]) @ self._poses[k]
-        keyframe = k == 0 or moved_on(moved)
-        self._row, self._keyframe = k, k if keyframe else self._keyframe
-        scan = deskewed_in_range(scan, k, self._poses, self._times, s)
-        placed = inverse_transform(self._poses[0]) @ self._poses[k]
-        return OdometryStep(timestamp, placed, self._noise if k else np.zeros((6, 6)), scan, keyframe, None)
-
-
-def deskewed_in_range(
-    scan: Scan, row: int, poses: Sequence[FloatArray] | FloatArray, timestamps: FloatArray, settings: OdometrySettings
-) -> Scan:
-    """Return a scan within range and without skew, by poses (K, 4, 4) of the sensor at all scans."""
-    scan, before = scan.within(settings.min_range, settings.max_range), max(row - 1, 0)
-    if scan.time is None or len(poses) < 2:
-        return scan
-    duration = float(timestamps[before + 1] - timestamps[before])
-    return deskewed(scan, constant_velocity(inverse_transform(poses[before]) @ poses[before + 1], duration))

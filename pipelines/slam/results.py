@@ -24,7 +24,7 @@ odometry.tum                by odometry alone; online.tum: as estimated when eac
 covariances.csv             of the sensor's pose at the keyframes
 map.ply                     the accumulated points of the keyframes, one a voxel, in world coordinates
 reference.tum               the recording's own poses; evo_ape tum reference.tum trajectory.tum gives the error
-map/                        the points of each submap (PLY or PCD) and its place (`pipelines.slam.submaps`)
+map/                        the points of each submap and its place (`pipelines.slam.drive`)
 graph.g2o                   poses as estimated, the first one's prior, odometry and loops as in the solution
 observations.csv            keyframe, landmark, kind, value, covariance: all observations of landmarks of the map, value
                             as the kind has it (a wall nx ny nz d, a pole x y z), the covariance as its upper triangle
@@ -57,11 +57,11 @@ from data_tools.laser import LaserLog, OccupancyGrid
 from data_tools.lidar import ScanSequence, write_cloud
 from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
+from pipelines.slam.drive import Origin, SlamMap, placed_clouds, write_map
 from pipelines.slam.driver import SlamResult
 from pipelines.slam.laser_slam import LaserPath
 from pipelines.slam.lidar_slam import WALL, LidarSlamSettings
 from pipelines.slam.localisation import LocalisedDrive
-from pipelines.slam.submaps import Origin, SlamMap, placed_clouds, write_map
 from saga_fg.numerics import FloatArray, IntArray, in_space, inverse_transform, transform_points, transforms
 from saga_fg.slam.joint import JointEstimate
 from saga_fg.slam.pose_graph import OptimisedPoses, PoseGraph
@@ -70,18 +70,11 @@ from saga_fg.types import Landmark
 _CONFIRMED = 5  # detections
 
 
-def landmark_row(
-    number: int, kind: str, coordinates: Mapping[str, float], covariance: FloatArray, observations: int
-) -> dict[str, Any]:
-    """Return the entry of landmarks.json for a landmark."""
-    counts = {"covariance": covariance.tolist(), "observations": observations}
-    return {"number": number, "kind": kind, **coordinates, **counts}
-
-
 def landmark_rows(landmarks: Iterable[Landmark]) -> list[dict[str, Any]]:
     """Return the content of landmarks.json for a map."""
     return [
-        landmark_row(mark.number, mark.kind.name, mark.kind.coordinates(mark.state), mark.covariance, mark.observations)
+        {"number": mark.number, "kind": mark.kind.name, **mark.kind.coordinates(mark.state)}
+        | {"covariance": mark.covariance.tolist(), "observations": mark.observations}
         for mark in landmarks
     ]
 
@@ -296,7 +289,7 @@ def write_lidar_slam(
         write_paths(folder, **given, reference=truth)
         if len(points):
             (folder / "map").mkdir()
-            write_map(folder / "map", SlamMap(clouds, result.world_T_submap, origin), s.map_format)
+            write_map(folder / "map", SlamMap(clouds, result.world_T_submap, origin))
             write_cloud(folder / "map.ply", points)
         write_graph(folder, result)
         times = result.trajectory.timestamps[result.keyframes].tolist()

@@ -22,7 +22,7 @@ import numpy as np
 
 from data_tools.lidar import Scan, ScanSequence, scan_context
 from pipelines.slam.odometry import LidarOdometry, Odometry, OdometrySettings, OdometryStep, checked_step
-from saga_fg.errors import InputError
+from saga_fg import InputError
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_BIAS, EGO_POSE, EGO_VELOCITY, FactorProvider
 from saga_fg.numerics import FloatArray, carried_covariance, checked_transform, inverse_transform, yaw_transform

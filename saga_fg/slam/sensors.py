@@ -16,12 +16,10 @@ drives its biases away. Of the newest factors of a provider, d_i residuals each,
 is a misfit; with half of the residuals wrong, outliers are no excuse. Biases are compared with their prior.
 """
 
-from __future__ import annotations
-
 import logging
 import math
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -44,33 +42,17 @@ __all__ = [
 
 _LOG = logging.getLogger(__name__)
 _LONGEST = 0.5  # s that the first measurement stands for at most; the second one says how long its interval is
+_HISTORY = 3  # measurements that were taken and are kept, whose intervals say what comes next
 _GAP = 3.0  # intervals like the one before, beyond which measurements are missing
 _NOTHING = 1e-9  # s
-
-
-@dataclass(frozen=True, eq=False)
-class _Span:
-    """A measurement and the time that it stands for, s."""
-
-    start: float
-    end: float
-    value: FloatArray
-    first: bool = False
-
-    def next(self, time: float, value: FloatArray) -> _Span:
-        """The measurement after this one, from where this one ends unless some are missing between them."""
-        if self.first:
-            return _Span(max(self.end, time - _LONGEST), time, value)
-        length = self.end - self.start
-        return _Span(self.end if time - self.end <= _GAP * length else time - length, time, value)
 
 
 class SensorBuffer:
     """Measurements that no pose has taken yet. Every method raises `InputError` for time that runs backwards."""
 
     def __init__(self) -> None:
-        self._kept: dict[str, list[_Span]] = {"imu": [], "wheels": []}
-        self._gps: list[tuple[float, FloatArray, FloatArray | None]] = []
+        self._kept: dict[str, list[tuple[float, FloatArray]]] = {"imu": [], "wheels": []}
+        self._gps = list[tuple[float, GpsFix]]()
         self._newest: dict[str, float] = {}
         self._taken = -math.inf
         self._silent: set[str] = set()
@@ -78,58 +60,59 @@ class SensorBuffer:
     def add_imu(self, time: float, acceleration: FloatArray, angular_rate: FloatArray) -> None:
         """Specific force (3,), m/s^2, and turn rate (3,), rad/s, at `time`, s, for the time since the sample before."""
         both = [checked("imu: acceleration", acceleration, (3,)), checked("imu: angular_rate", angular_rate, (3,))]
-        self._add("imu", time, np.concatenate(both))
+        self._in_order("imu", time)
+        self._kept["imu"].append((time, np.concatenate(both)))
 
     def add_wheels(self, time: float, speed: float) -> None:
         """Speed ahead, m/s, at `time`, s, for the time since the speed before."""
         if not math.isfinite(speed):
             raise InputError(f"wheels: speed: expected a finite number, got {speed!r}")
-        self._add("wheels", time, np.array([speed]))
+        self._in_order("wheels", time)
+        self._kept["wheels"].append((time, np.array([speed])))
 
     def add_gps(self, time: float, position: FloatArray, covariance: FloatArray | None = None) -> None:
         """A place (2,) or (3,), world, m, at `time`, s; covariance, m^2: by the settings if None."""
         fix = GpsFix(position, covariance)
         self._in_order("gps", time)
-        self._gps.append((time, fix.position, fix.covariance))
+        self._gps.append((time, fix))
 
     def take(self, time: float) -> EgoMeasurements:
         """The measurements after the last pose and up to this one, at `time`, s, which then count as taken."""
         if not time > self._taken:
             raise InputError(f"time: expected one after {self._taken:.6f} s, got {time:.6f} s")
         since, self._taken = self._taken, time
-        fixes = [one for one in self._gps if since < one[0] <= time]
-        for name, spans in self._kept.items():
-            self._notice_gap(name, spans, since, time)
-        found = EgoMeasurements(
-            gps=GpsFix(fixes[-1][1], fixes[-1][2], time - fixes[-1][0]) if fixes else None,
-            imu=_samples(*_measured(self._kept["imu"], since, time)),
-            wheels=_speed(*_measured(self._kept["wheels"], since, time)),
-        )
-        self._kept = {name: _kept(spans, time) for name, spans in self._kept.items()}
+        fixes = [replace(fix, age=time - then) for then, fix in self._gps if since < then <= time]
         self._gps = [one for one in self._gps if one[0] > time]
-        return found
+        (dt, samples), (rolled, speeds) = (self._measured(name, since, time) for name in ("imu", "wheels"))
+        imu = ImuSamples(dt, samples[:, :3], samples[:, 3:]) if len(dt) else None
+        total = float(rolled.sum())
+        wheels = WheelSpeed(float(rolled @ speeds[:, 0]) / total, total) if len(rolled) else None
+        return EgoMeasurements(gps=fixes[-1] if fixes else None, imu=imu, wheels=wheels)
 
-    def _notice_gap(self, sensor: str, kept: Sequence[_Span], since: float, until: float) -> None:
-        """Warn once when a sensor falls silent."""
-        if not kept or not math.isfinite(since):
-            return
-        missing = until - since - float(_spans(kept, since, until).sum())
-        silent = missing > _GAP * (kept[0].end - kept[0].start) and kept[0].start < since
+    def _measured(self, sensor: str, since: float, until: float) -> tuple[FloatArray, FloatArray]:
+        """Times (n,) of an interval, s, that measurements stand for, and these (n, d).
+
+        A measurement stands for the time since the one before, or for as long as that one where some are missing
+        between them; the newest also for as long after it. Warns once when a sensor falls silent.
+        """
+        if not (kept := self._kept[sensor]):
+            return np.empty(0), np.empty((0, 0))
+        time, value = (np.array(column) for column in zip(*kept, strict=True))
+        self._kept[sensor] = kept[max(int(np.searchsorted(time, until, side="right")) - _HISTORY, 0) :]
+        length = np.diff(time, prepend=-math.inf)
+        length[:2] = length[1:2].min(initial=_LONGEST)
+        length[1:] = np.where(length[1:] > _GAP * length[:-1], length[:-1], length[1:])
+        start, end = time - length, time.copy()
+        if since < time[-1] <= until:
+            end[-1] += min(until - end[-1], length[-1])
+        spans = np.clip(np.minimum(end, until) - np.maximum(start, since), 0.0, None)
+        missing = until - since - float(spans.sum())
+        silent = start[0] < since and missing > _GAP * float(np.median(length))
         if silent and sensor not in self._silent:
             _LOG.warning("%s: no measurements for %.2f s before %.2f s", sensor, missing, until)
         (self._silent.add if silent else self._silent.discard)(sensor)
-
-    def _add(self, sensor: str, time: float, value: FloatArray) -> None:
-        """Add a measurement; the interval between the first two is that of the first, too."""
-        self._in_order(sensor, time)
-        kept = self._kept[sensor]
-        if not kept:
-            kept.append(_Span(time - _LONGEST, time, value, first=True))
-            return
-        last = kept[-1]
-        kept.append(last.next(time, value))
-        if last.first:
-            kept[-2] = _Span(last.end - (time - kept[-1].start), last.end, last.value)
+        used = (spans > _NOTHING) & math.isfinite(since)
+        return spans[used], value[used]
 
     def _in_order(self, sensor: str, time: float) -> None:
         newest = self._newest.get(sensor, -math.inf)
@@ -138,39 +121,6 @@ class SensorBuffer:
         if time <= self._taken:
             raise InputError(f"{sensor}: {time:.6f} s comes too late, the pose at {self._taken:.6f} s is estimated")
         self._newest[sensor] = time
-
-
-def _kept(spans: list[_Span], time: float) -> list[_Span]:
-    """Those that reach beyond a time, and the one before them, whose length says what comes next."""
-    first = next((k for k, one in enumerate(spans) if one.end > time), len(spans))
-    return spans[max(first - 1, 0) :]
-
-
-def _spans(kept: Sequence[_Span], since: float, until: float) -> FloatArray:
-    """Time (n,) that each measurement stands for within an interval, s; the newest also for as long after it."""
-    start, end = np.array([(one.start, one.end) for one in kept]).T
-    last = int(np.searchsorted(end, until, side="right")) - 1
-    if last == len(kept) - 1 and end[last] > since:
-        end[last] += min(until - end[last], end[last] - start[last])
-    return np.asarray(np.clip(np.minimum(end, until) - np.maximum(start, since), 0.0, None))
-
-
-def _measured(kept: Sequence[_Span], since: float, until: float) -> tuple[FloatArray, FloatArray]:
-    """Times (n,) of an interval, s, that measurements stand for, and these (n, d)."""
-    if not kept or not math.isfinite(since):
-        return np.empty(0), np.empty((0, 0))
-    spans = _spans(kept, since, until)
-    used = spans > _NOTHING
-    return spans[used], np.array([one.value for one in kept])[used]
-
-
-def _samples(spans: FloatArray, values: FloatArray) -> ImuSamples | None:
-    return ImuSamples(spans, values[:, :3], values[:, 3:]) if len(spans) else None
-
-
-def _speed(spans: FloatArray, values: FloatArray) -> WheelSpeed | None:
-    total = float(spans.sum())
-    return WheelSpeed(float(spans @ values[:, 0]) / total, total) if len(spans) else None
 
 
 SensorName = Literal["gps", "imu", "wheels"]

@@ -46,11 +46,9 @@ from pipelines.report.scenes import thumbnails
 from pipelines.review import read_label_run
 from pipelines.serving import StateKeeper, StreamTracker
 from pipelines.slam.configuration import SlamConfig, load_slam_config
-from pipelines.slam.submaps import SlamMap, read_map, write_map
-from saga_fg.model.sensor import GroundCamera
+from pipelines.slam.drive import SlamMap, read_map, write_map
+from saga_fg import Boxes, Dataset, GroundCamera, Scene
 from saga_fg.smoothing.corrections import correction_from
-from saga_fg.types.boxes import Boxes
-from saga_fg.types.dataset import Dataset, Scene
 from tests.benchmarks.recordings.ngsim_example import HEADER, crossing, rows
 from tests.data_tools.kitti_example import write_sequence
 from tests.data_tools.nuscenes_example import box, results, write_results, write_tables
@@ -261,7 +259,7 @@ def _images(folder: Path) -> Target:
 def _map(folder: Path) -> Target:
     folder.mkdir()
     points = (np.ones((2, 3), dtype=np.float32),)
-    write_map(folder, SlamMap(points, np.eye(4)[None], (49.0, 8.4, 110.0)), "pcd")
+    write_map(folder, SlamMap(points, np.eye(4)[None], (49.0, 8.4, 110.0)))
     return Target((folder / "submaps.csv", folder / "origin.csv"), lambda: read_map(folder))
 
 

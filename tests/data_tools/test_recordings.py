@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from data_tools.datasets.kitti import kitti_scans
+from data_tools.datasets.kitti import KittiTracking
 from data_tools.metrics.kitti_boxes import CameraBoxes, camera_boxes_to_world, world_boxes_to_camera
 from data_tools.sensor_logs import SensorLog, kitti_sensor_log, read_sensor_log
 from saga_fg import InputError
-from saga_fg.numerics.geometry import yaw_transform
+from saga_fg.numerics import yaw_transform
 
 LEVEL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=float)  # looks along world x
 
@@ -138,11 +138,11 @@ def test_a_log_is_fed_as_time_goes_on():
 
 def test_the_records_of_kitti(recordings):
     """Speeds and turn rates of the records agree with their poses."""
-    scans = kitti_scans(recordings / "kitti", "0000", blind=True)
+    poses = KittiTracking(recordings / "kitti", sequences=["0000"]).scene("0000").world_T_ego
     path = recordings / "kitti" / "training" / "oxts" / "0000.txt"
     log = kitti_sensor_log(path, ("gps", "imu", "wheels"), seed=0)
-    driven = np.linalg.norm(np.diff(scans.world_T_ego[:, :3, 3], axis=0), axis=1) / 0.1
+    driven = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / 0.1
     speed = log.tables["wheels"][1:, 1]
     assert np.abs(speed - driven).mean() < 0.3
-    assert 0.5 < np.std(log.tables["gps"][:, 1:] - scans.world_T_ego[:, :3, 3]) < 1.5
+    assert 0.5 < np.std(log.tables["gps"][:, 1:] - poses[:, :3, 3]) < 1.5
     assert np.abs(log.tables["imu"][:, 3].mean() - 9.8) < 0.3

@@ -122,9 +122,6 @@ def test_options_that_do_not_go_together(tmp_path: Path, subtests: pytest.Subtes
             "--covariances: expected all, last, none or ids of poses with commas, got 'e",
         ),
         (["--covariances", "last,10"], "--covariances: expected last alone or ids of poses with commas, got 'last,10'"),
-        (["--robust-scale", "2"], "--robust-scale: expected with --robust and the name of a loss only"),
-        (["--robust", "consensus", "--robust-scale", "2"], "--robust-scale: expected with --robust"),
-        (["--robust", "huber", "--robust-scale", "-1"], "--robust-scale -1: expected a number > 0"),
     ]:
         with subtests.test(message):
             graph, _ = loop(2, seed=0)

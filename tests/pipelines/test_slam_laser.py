@@ -12,10 +12,9 @@ import pytest
 from benchmarks.scans import LaserKind, laser_drive, write_carmen
 from data_tools.laser import LaserLog, read_carmen
 from data_tools.trajectories import read_tum_poses
-from pipelines.slam.laser_odometry import LaserSettings
-from pipelines.slam.laser_slam import LaserSlam, laser_slam
+from pipelines.slam.laser_slam import LaserSettings, LaserSlam, laser_slam
 from saga_fg import InputError
-from saga_fg.numerics.geometry import transform, transforms, vectors
+from saga_fg.numerics import transform, transforms, vectors
 from tests.pipelines.command import done, refused
 
 

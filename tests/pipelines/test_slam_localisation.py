@@ -12,16 +12,16 @@ from benchmarks.scans import SENSOR_HEIGHT, SimulatedScans
 from data_tools.lidar import Scan
 from data_tools.pose_graphs import read_g2o
 from data_tools.sensor_logs import SensorLog
+from pipelines.slam.drive import SlamMap, read_map, write_map
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from pipelines.slam.localisation import Localiser, LocaliserSettings, localise
 from pipelines.slam.results import write_lidar_slam, write_localised
-from pipelines.slam.submaps import SlamMap, read_map, write_map
 from pipelines.slam.vehicle_sensors import Vehicle
-from saga_fg.errors import InputError
-from saga_fg.numerics.geometry import inverse_transform, yaw_transform
+from saga_fg import InputError
+from saga_fg.numerics import inverse_transform, yaw_transform
 from saga_fg.slam.pose_graph import optimise_poses
 from saga_fg.slam.submaps import SubmapSettings
-from saga_fg.types.frame import GpsFix, WheelSpeed
+from saga_fg.types import GpsFix, WheelSpeed
 
 PLAIN = LidarSlamSettings(landmarks=False, loop_closures=False, submaps=SubmapSettings(length=20.0))
 
@@ -58,7 +58,7 @@ def test_a_second_drive_the_other_way_is_recognised_and_followed(known: SlamMap)
 
 
 def test_a_guess_takes_the_place_of_the_search(known: SlamMap, tmp_path: Path) -> None:
-    write_map(tmp_path, known, "pcd")
+    write_map(tmp_path, known)
     again = read_map(tmp_path)
     np.testing.assert_allclose(again.map_T_submap, known.map_T_submap, atol=1e-8)
     np.testing.assert_array_equal(again.points[1], known.points[1])
@@ -243,8 +243,8 @@ def test_the_files_of_a_run_are_a_map_and_a_graph(tmp_path: Path) -> None:
     """What SLAM has written is read back: submaps, pose graph, landmarks; a second drive finds itself in it."""
     scans = SimulatedScans(3, world_T_lidar=drive(0.0, -1.5, 40))
     result = lidar_slam(scans, settings=LidarSlamSettings(submaps=SubmapSettings(length=20.0)))
-    write_lidar_slam(tmp_path / "first", result, scans, settings=LidarSlamSettings(map_format="pcd"))
-    assert len(list((tmp_path / "first" / "map").glob("*.pcd"))) == len(result.submaps)
+    write_lidar_slam(tmp_path / "first", result, scans, settings=LidarSlamSettings())
+    assert len(list((tmp_path / "first" / "map").glob("*.ply"))) == len(result.submaps)
     graph = read_g2o(tmp_path / "first" / "graph.g2o")
     assert len(graph) == len(result.keyframes)
     np.testing.assert_allclose(graph.world_T_pose, result.world_T_lidar, atol=1e-9)

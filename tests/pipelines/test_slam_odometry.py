@@ -21,11 +21,9 @@ from pipelines.slam.odometry import (
     OdometrySettings,
     OdometryStep,
 )
-from saga_fg import Boxes, Detections, Frame
-from saga_fg.errors import InputError
-from saga_fg.numerics.arrays import FloatArray
-from saga_fg.numerics.geometry import inverse_transform, transform_points, yaw_transform
-from saga_fg.slam.pose_graph.consensus import shortest_paths
+from saga_fg import Boxes, Detections, Frame, InputError
+from saga_fg.numerics import FloatArray, inverse_transform, transform_points, yaw_transform
+from saga_fg.slam.pose_graph.optimisation import shortest_paths
 from saga_fg.slam.submaps import LoopClosure
 from tests.data_tools.featureless import tunnel
 

@@ -15,8 +15,8 @@ from data_tools.recordings import open_recording
 from data_tools.trajectories import Trajectory, read_tum_poses, trajectory_errors
 from pipelines.slam.laser_slam import laser_slam
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
-from saga_fg.errors import InputError
-from saga_fg.numerics.geometry import inverse_transform, yaw_transform
+from saga_fg import InputError
+from saga_fg.numerics import inverse_transform, yaw_transform
 from tests.data_tools import mcap_example as example
 from tests.data_tools.recordings.test_bags import laser_messages
 from tests.data_tools.scans_example import BEGIN, FIX, IMU, fix_message, imu_message, scan_messages, write_scans
@@ -143,7 +143,6 @@ def test_options_that_are_wrong_are_named(tmp_path: Path, drive: SimulatedScans)
         (["--topic", "a=b", "--topic", "a=c"], "--topic a=c: expected TOPIC or SENSOR=TOPIC, once for each sensor"),
         (["--layout", "kitty"], "unknown layout 'kitty'"),
         (["--objects"], "--objects: expected a recording with detections"),
-        (["--odometry", "recorded"], "odometry: expected poses in the recording, it has none"),
         (["--sensors", "gps"], "--sensors gps: expected a sensor of the recording, it has none"),
     ):
         code, output = run("scans", folder, *options, "--output", tmp_path / "run")

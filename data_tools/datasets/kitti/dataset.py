@@ -334,24 +334,19 @@ def local_kitti(
         yield KittiTracking(root, boxes, sequences, ground_truth)
 
 
-def kitti_scans(dataroot: str | Path, sequence: str, most: int | None = None, blind: bool = False) -> ScanRecording:
+def kitti_scans(dataroot: str | Path, sequence: str, most: int | None = None) -> ScanRecording:
     """The scans of a sequence, the first `most` or all of them, with times of points, and poses by GPS/IMU.
 
-    With `blind` there is one for each GPS/IMU record, without any points, for what needs none.
     Raises `InputError` where there are none, and for a scan without a GPS/IMU record.
     """
     root = Path(dataroot)
     root = root / "training" if (root / "training").is_dir() else root
     dataset = KittiTracking(dataroot, sequences=[sequence])
     calibration, poses = dataset.calibration(sequence), dataset.scene(sequence).world_T_ego
-    folder, rows = root / "velodyne" / sequence, np.arange(len(poses))
-    if not blind:
-        rows = np.array([int(path.stem) for path in _files(folder, len(poses))])
-    rows = rows[:most]
+    folder = root / "velodyne" / sequence
+    rows = np.array([int(path.stem) for path in _files(folder, len(poses))])[:most]
 
     def read(row: int) -> Scan:
-        if blind:
-            return Scan(np.empty((0, 3)), np.empty(0))
         scan = read_records(folder / f"{rows[row]:06d}.bin", KITTI)
         return replace(scan, time=azimuth_times(scan.points, FRAME_PERIOD))
 
@@ -362,7 +357,6 @@ def kitti_scans(dataroot: str | Path, sequence: str, most: int | None = None, bl
         lambda row: str(folder / f"{rows[row]:06d}.bin"),
         inverse_transform(calibration.camera_T_imu) @ calibration.camera_T_velodyne,
         poses[rows],
-        blind=blind,
     )
 
 

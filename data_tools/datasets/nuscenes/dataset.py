@@ -38,7 +38,8 @@ from data_tools.datasets.nuscenes.tables import (
 from data_tools.datasets.source import AreaMap, Images, Kind, map_points
 from data_tools.files import parsed_json, read_bytes
 from data_tools.lidar import NUSCENES, ScanRecording, read_records
-from saga_fg.errors import InputError, error_context, unknown_name
+from saga_fg import InputError
+from saga_fg.errors import error_context, unknown_name
 from saga_fg.numerics import FloatArray
 from saga_fg.types import Annotations, Detections, Frame, Scene
 

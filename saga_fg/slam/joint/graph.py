@@ -8,7 +8,7 @@ Factors of a record: poses of the vehicle, errors of its odometry, and states of
     detection    a pose and an object's state              (`factors.poses`), robust
     stationary   p' - p ~ N(0, stationary_drift^2 dt),  v' ~ N(0, stationary_speed^2)     with probability P
 
-The last one is the hybrid part of the model. With the probability P (`saga_fg.slam.joint.association`) an object is
+The last one is the hybrid part of the model. With the probability P (`saga_fg.slam.joint.record`) an object is
 stationary and a landmark, else it moves as its class does and the factor is silent: a mixture (`factors.Mixture`). A
 variable is a `gtsam.Pose3` for the vehicle and a vector for everything else.
 
@@ -19,10 +19,11 @@ along the path so far, starting with the odometry's, takes the probabilities of 
 solves the graph of all epochs. Passes end when associations repeat.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -36,13 +37,13 @@ from factors import (
     Solution,
     SolverSettings,
     gaussian_factors,
-    interaction_factor,
     odometry_factors,
+    pose_prior_factor,
     prior_factor,
     relative_factors,
 )
 from saga_fg.errors import InputError
-from saga_fg.estimators import GraphSolution
+from saga_fg.estimators import GraphSolution, Interactions
 from saga_fg.graph import (
     EGO_ERROR,
     EGO_POSE,
@@ -58,15 +59,16 @@ from saga_fg.graph import (
 )
 from saga_fg.model import POSITION, VELOCITY, NodeType
 from saga_fg.numerics import Assignment, FloatArray, IntArray, transform_points
-from saga_fg.slam.joint.association import SlowErrors, stationary_probabilities
 from saga_fg.slam.joint.record import (
     MAX_ITERATIONS,
     JointSettings,
     OdometryIncrements,
     RecordedEpoch,
     RecordedObjects,
+    SlowErrors,
     motion_covariances,
     record_epochs,
+    stationary_probabilities,
 )
 from saga_fg.slam.mapping import pose_key
 from saga_fg.tracking import Tracker
@@ -90,22 +92,6 @@ def object_key(epoch: int, name: int) -> int:
     return key_of(OBJECT, name, epoch)
 
 
-def start_factors(
-    epoch: int, world_T_ego: FloatArray, settings: JointSettings
-) -> tuple[gtsam.JacobianFactor, gtsam.NonlinearFactor]:
-    """Priors of the odometry's errors and of the first pose, which fixes the world frame."""
-    noise = settings.odometry
-    slow = prior_factor(error_key(epoch), np.zeros(ERROR_DIM), np.diag([noise.scale, noise.bias, noise.course]) ** 2)
-    sigma = gtsam.noiseModel.Isotropic.Sigma(6, _START_NOISE)
-    return slow, gtsam.PriorFactorPose3(pose_key(epoch), gtsam.Pose3(world_T_ego), sigma)
-
-
-def new_object_factors(now: RecordedEpoch, known: set[int]) -> list[GaussianFactors]:
-    """Priors of new objects; known: ids of the objects of the epoch before."""
-    new = np.flatnonzero(~np.isin(now.objects.id, np.array(sorted(known), dtype=np.int64)))
-    return _priors(now.epoch, now.objects.select(new))
-
-
 def odometry(record: Record, settings: JointSettings) -> list[ResidualFactors]:
     """Poses and slow errors of consecutive epochs."""
     if len(record) < 2:
@@ -117,6 +103,15 @@ def odometry(record: Record, settings: JointSettings) -> list[ResidualFactors]:
     return [odometry_factors(rows, steps, dt, motion_covariances(record, settings))]
 
 
+def _by_type(rows: Iterable[tuple[Any, ...]]) -> Iterator[tuple[NodeType, tuple[FloatArray, ...]]]:
+    """Columns of rows, each a node type and numbers, for each type."""
+    collected: dict[NodeType, list[Any]] = {}
+    for node_type, *numbers in rows:
+        collected.setdefault(node_type, []).append(numbers)
+    for node_type, mine in collected.items():
+        yield node_type, tuple(np.array(column) for column in zip(*mine, strict=True))
+
+
 def _priors(k: int, new: RecordedObjects) -> list[GaussianFactors]:
     """All components of new objects but the position: unknown velocities, and others, N(0, 1).
 
@@ -124,53 +119,48 @@ def _priors(k: int, new: RecordedObjects) -> list[GaussianFactors]:
     errors of one sign would pull at the vehicle.
     """
     factors = []
-    for node_type, mine in by_type(new.types):
+    for node_type, (names,) in _by_type(zip(new.types, new.id, strict=True)):
         rest = [c for c in node_type.components if c not in POSITION]
-        H = node_type.selector(rest)
-        deviation = np.ones((len(mine), len(rest)))
-        deviation[:, [rest.index(c) for c in VELOCITY]] = _ANY_SPEED
-        keys = np.array([[object_key(k, int(name))] for name in new.id[mine]], dtype=np.uint64)
-        blocks = np.broadcast_to(H, (len(mine), *H.shape))
-        covariances = deviation[:, :, None] ** 2 * np.eye(len(rest))
-        factors.append(gaussian_factors(keys, [blocks], np.zeros(deviation.shape), covariances))
+        keys = np.array([[object_key(k, name)] for name in names.tolist()], dtype=np.uint64)
+        H = np.tile(node_type.selector(rest), (len(keys), 1, 1))
+        variance = np.diag([_ANY_SPEED**2 if c in VELOCITY else 1.0 for c in rest])
+        factors.append(
+            gaussian_factors(keys, [H], np.zeros((len(keys), len(rest))), np.tile(variance, (len(keys), 1, 1)))
+        )
     return factors
 
 
 def detections(record: Record, settings: JointSettings) -> list[ResidualFactors]:
     """Detections of objects, from the vehicle's pose."""
     robust = None if np.isinf(settings.outlier_scale) else Robust("cauchy", settings.outlier_scale)
-    collected: dict[NodeType, list[tuple[int, int, FloatArray, FloatArray]]] = {}
+    rows = list[tuple[Any, ...]]()
     for now in record:
-        types = dict(zip(now.objects.id.tolist(), now.objects.types, strict=True))
-        for name, z, R in zip(now.seen.id.tolist(), now.seen.z, now.seen.R, strict=True):
-            collected.setdefault(types[name], []).append((pose_key(now.epoch), object_key(now.epoch, name), z, R))
-    factors: list[ResidualFactors] = []
-    for node_type, rows in collected.items():
-        x, y = node_type.index(POSITION).tolist()
-        pose, thing, z, R = (np.array(column) for column in zip(*rows, strict=True))
-        keys = np.column_stack([pose, thing]).astype(np.uint64)
-        factors.append(relative_factors(keys, z, R, node_type.dim, (x, y), robust))
-    return factors
+        types = now.objects.types[np.searchsorted(now.objects.id, now.seen.id)]
+        names = now.seen.id.tolist()
+        keys = [(pose_key(now.epoch), object_key(now.epoch, name)) for name in names]
+        rows += zip(types, keys, now.seen.z, now.seen.R, strict=True)
+    return [
+        relative_factors(keys.astype(np.uint64), z, R, node_type.dim, node_type.index(POSITION).tolist(), robust)
+        for node_type, (keys, z, R) in _by_type(rows)
+    ]
 
 
 def stationary_factors(record: Record, stationary: Sequence[FloatArray]) -> list[ResidualFactors]:
     """Between two epochs of an object that may be stationary at both; stationary: probabilities (n,) of each."""
-    collected: dict[NodeType, list[tuple[int, int, float, float]]] = {}
+    rows = list[tuple[Any, ...]]()
     for (before, p_before), (now, p_now) in pairwise(zip(record, stationary, strict=True)):
         names, here, there = np.intersect1d(now.objects.id, before.objects.id, return_indices=True)
         p = np.minimum(p_now[here], p_before[there])
         for row in np.flatnonzero(p > _LIKELY).tolist():
-            name, node_type = int(names[row]), now.objects.types[int(here[row])]
-            keys = object_key(before.epoch, name), object_key(now.epoch, name)
-            collected.setdefault(node_type, []).append((*keys, float(p[row]), now.time - before.time))
+            both = [object_key(epoch, int(names[row])) for epoch in (before.epoch, now.epoch)]
+            rows.append((now.objects.types[here[row]], both, p[row], now.time - before.time))
     factors: list[ResidualFactors] = []
-    for node_type, rows in collected.items():
+    for node_type, (keys, p, dt) in _by_type(rows):
         model = _StationaryResidual(node_type.dim, tuple(node_type.index(POSITION)), tuple(node_type.index(VELOCITY)))
-        first, second, p, dt = (np.array(column) for column in zip(*rows, strict=True))
         drift, speed = STATIONARY_DRIFT**2 * dt, np.full(len(dt), STATIONARY_SPEED**2)
         factors.append(
             ResidualFactors(
-                np.column_stack([first, second]).astype(np.uint64),
+                keys.astype(np.uint64),
                 (node_type.dim, node_type.dim),
                 model.residual,
                 np.stack([drift, drift, speed, speed], axis=1)[:, :, None] * np.eye(4),
@@ -199,37 +189,6 @@ class _StationaryResidual:
         J_before[:, [0, 1], list(self.position)] = -1.0
         J_now[:, [0, 1, 2, 3], [*self.position, *self.velocity]] = 1.0
         return [J_before, J_now]
-
-
-def by_type(types: Sequence[NodeType]) -> list[tuple[NodeType, np.ndarray[tuple[int], np.dtype[np.int64]]]]:
-    """Rows of equal node type, with the type."""
-    rows: dict[NodeType, list[int]] = {}
-    for row, node_type in enumerate(types):
-        rows.setdefault(node_type, []).append(row)
-    return [(node_type, np.array(mine, dtype=np.int64)) for node_type, mine in rows.items()]
-
-
-def motion_factors(now: RecordedEpoch) -> list[gtsam.JacobianFactor]:
-    """Motion and interactions from the epoch before.
-
-    Raises `InputError` for motions and interactions that are not linear.
-    """
-    transition, k = now.transition, now.epoch
-    if transition is None:
-        return []
-    if transition.graph.nonlinear or any(node_type.flow is not None for node_type in transition.graph.types):
-        raise InputError("motion: expected linear motion and interactions of objects beside a vehicle's path")
-    factors, names = list[gtsam.JacobianFactor](), transition.nodes.tolist()
-    sources: list[list[tuple[int, FloatArray]]] = [[] for _ in names]
-    for blocks in transition.F:
-        for i, j, F in zip(blocks.target.tolist(), blocks.source.tolist(), blocks.values, strict=True):
-            sources[i].append((object_key(k - 1, names[j]), F))
-    for blocks in transition.Q:
-        for i, Q in zip(blocks.target.tolist(), blocks.values, strict=True):
-            keys, F = [key for key, _ in sources[i]], [one for _, one in sources[i]]
-            b = transition.b[transition.offsets[i] : transition.offsets[i + 1]]
-            factors.append(interaction_factor(object_key(k, names[i]), keys, F, b, Q))
-    return factors
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,7 +273,7 @@ def _objects(now: RecordedEpoch, values: gtsam.Values, stationary: FloatArray) -
     state = np.zeros((len(objects.id), 4))
     for row, (name, node_type) in enumerate(zip(objects.id.tolist(), objects.types, strict=True)):
         state[row] = values.atVector(object_key(now.epoch, name))[node_type.index(POSITION + VELOCITY)]
-    return ObjectStates(objects.id, objects.label, state[:, :2], state[:, 2:], stationary)
+    return ObjectStates(objects.id, tuple(objects.label.tolist()), state[:, :2], state[:, 2:], stationary)
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,28 +293,27 @@ class VehicleAndObjects:
     def factors(self, view: GraphView) -> Additions:
         row = view.epoch - self.record[0].epoch
         now, pose, k = self.record[row], self.path[row - self.known], view.epoch
-        before = set(self.record[row - 1].objects.id.tolist()) if row else set()
         slow = view.state(error_key(k - 1)) if k else np.zeros(ERROR_DIM)
         new = [NewVariable(EGO_POSE, 0, gtsam.Pose3(pose), label="vehicle"), NewVariable(EGO_ERROR, 0, slow)]
+        moved = Additions() if now.transition is None else Interactions(now.transition).factors(view)
+        states = {variable.id: variable.state for variable in moved.variables}
         seen = dict(zip(now.seen.id.tolist(), transform_points(pose, now.seen.z)[:, :2], strict=True))
         objects = now.objects
-        for name, kind, label in zip(objects.id.tolist(), objects.types, objects.label, strict=True):
-            state = np.zeros(kind.dim)
-            if name in before:  # at constant velocity
-                state = np.array(view.state(object_key(k - 1, name)))
-                state[kind.index(POSITION)] += view.dt * state[kind.index(VELOCITY)]
+        for name, kind, label in zip(objects.id.tolist(), objects.types, objects.label.tolist(), strict=True):
+            state = np.array(states.get(name, np.zeros(kind.dim)))
             if name in seen:
                 state[kind.index(POSITION)] = seen[name]
             new.append(NewVariable(OBJECT, name, state, label=label))
-        factors: list[Factor] = [*new_object_factors(now, before)]
-        if before:
-            factors += motion_factors(now)
+        factors: list[Factor] = [*_priors(k, objects.select(~np.isin(objects.id, list(states))))]
         if k == 0:
-            factors += start_factors(k, pose, self.settings)
+            noise = self.settings.odometry
+            deviations = [noise.scale, noise.bias, noise.course]
+            factors.append(prior_factor(error_key(k), np.zeros(ERROR_DIM), np.diag(np.square(deviations))))
+            factors.append(pose_prior_factor(pose_key(k), pose, _START_NOISE**2 * np.eye(6)))
         if row + 1 == len(self.record):
             factors += odometry(self.record[max(self.known - 1, 0) :], self.settings)
             factors += detections(self.record[self.known :], self.settings)
-        return Additions(new, factors)
+        return Additions(new, factors, moved.named)
 
 
 TOLERANCE = 1.0  # standard deviations of the last step, over all variables together

@@ -2,7 +2,6 @@
 
 from saga_fg.slam.pose_graph.certificate import ChordalMinimum, chordal_minimum
 from saga_fg.slam.pose_graph.chordal import ChordalCost, chordal_poses, nearest_rotations
-from saga_fg.slam.pose_graph.consensus import Consensus, consensus
 from saga_fg.slam.pose_graph.graph import (
     PointLandmarks,
     PoseGraph,
@@ -11,7 +10,9 @@ from saga_fg.slam.pose_graph.graph import (
     trusted,
 )
 from saga_fg.slam.pose_graph.optimisation import (
+    Consensus,
     OptimisedPoses,
+    consensus,
     factor_graph,
     graph_error,
     optimise_poses,

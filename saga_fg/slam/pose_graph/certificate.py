@@ -30,8 +30,6 @@ frames by the polar decomposition. Source: Absil, Mahony, Sepulchre, Optimizatio
 (2008), algorithms 10 and 11.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,5 +1,5 @@
+from .between import LoopClosure, Loops, LoopSelection, loop_factors, select_loops
 from .graph import SolvedDrive, SubmapGraph, SubmapSettings
-from .loops import LoopClosure, Loops, LoopSelection, loop_factors, select_loops
 
 __all__ = [
     "LoopClosure",

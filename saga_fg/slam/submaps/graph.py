@@ -23,7 +23,7 @@ of houses in a row are.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, Any
@@ -46,8 +46,15 @@ from saga_fg.slam.mapping import (
     landmark_key,
     pose_key,
 )
-from saga_fg.slam.submaps.condensing import CondensedSubmap
-from saga_fg.slam.submaps.loops import LoopClosure, Loops, LoopSelection, Motion, loop_factors, select_loops
+from saga_fg.slam.submaps.between import (
+    CondensedSubmap,
+    LoopClosure,
+    Loops,
+    LoopSelection,
+    Motion,
+    loop_factors,
+    select_loops,
+)
 from saga_fg.types import Frame, Landmark, Observation
 
 _GAP = 3.0  # m
@@ -134,6 +141,10 @@ class Recorded:
     def name(self) -> str:
         return str(getattr(self.provider, "name", type(self.provider).__name__))
 
+    def predict(self, view: GraphView) -> Additions:
+        predict = getattr(self.provider, "predict", None)
+        return self._kept(view, predict(view)) if callable(predict) else Additions()
+
     def factors(self, view: GraphView) -> Additions:
         return self._kept(view, self.provider.factors(view))
 
@@ -145,23 +156,6 @@ class Recorded:
         if isinstance(added, Additions) and (added.variables or len(_list(added.factors)) or added.named):
             self.additions.setdefault(view.epoch, []).append(added)
         return added
-
-
-@dataclass(eq=False)
-class RecordedPredictor(Recorded):
-    """One with a `predict`."""
-
-    def predict(self, view: GraphView) -> Additions:
-        predict: Any = self.provider
-        return self._kept(view, predict.predict(view))
-
-
-def recorded(providers: Iterable[FactorProvider]) -> list[Recorded]:
-    """Wrap providers."""
-    return [
-        (RecordedPredictor if callable(getattr(provider, "predict", None)) else Recorded)(provider)
-        for provider in providers
-    ]
 
 
 def _list(factors: Any) -> Sequence[Any]:
@@ -240,13 +234,13 @@ class SubmapGraph:
         providers: Sequence[FactorProvider] = (),
     ) -> None:
         self.settings = settings or SubmapSettings()
-        self._providers = recorded(providers)
+        self._providers = [Recorded(provider) for provider in providers]
         relinearisation = RelinearisationSettings(self.settings.relinearise_above)
         self.smoother = IncrementalSmoother(lag=None, settings=relinearisation, elimination="cholesky")
         self._motions: list[Motion] = [(world_T_first, covariance)]
         self._times: list[float] = []
         self._seen: list[Sequence[tuple[int, Observation]]] = []
-        self._anchors: list[int] = []
+        self.anchors: list[int] = []  # keyframes, that of the running submap last
         self._offsets: list[FloatArray] = []  # of keyframes from the anchors of their submaps, where that is closed
         self._loops: list[LoopClosure] = []  # between submaps, by their numbers
         self._landmarks = SubmapLandmarks()
@@ -254,16 +248,6 @@ class SubmapGraph:
 
     def __len__(self) -> int:
         return len(self._times)
-
-    @property
-    def anchors(self) -> Sequence[int]:
-        """Numbers of the keyframes that are anchors, that of the running submap last."""
-        return self._anchors
-
-    @property
-    def size(self) -> int:
-        """Number of variables in the running graph."""
-        return len(self.smoother.graph().variables)
 
     def append(
         self,
@@ -281,7 +265,7 @@ class SubmapGraph:
             raise InputError("motion: expected one for every keyframe but the first")
         measured = self._motions[0] if motion is None else motion
         way = self._way + (0.0 if motion is None else float(np.linalg.norm(measured[0][:3, 3])))
-        begins = k == 0 or way >= self.settings.length or k - self._anchors[-1] >= MAX_KEYFRAMES
+        begins = k == 0 or way >= self.settings.length or k - self.anchors[-1] >= MAX_KEYFRAMES
         start = measured[0] if k == 0 else self.pose(k - 1) @ measured[0]
         landmarks = SubmapLandmarks() if begins else self._landmarks.copy()
         if motion is not None and not begins:
@@ -305,19 +289,19 @@ class SubmapGraph:
     def close_loops(self, loops: Sequence[LoopClosure]) -> None:
         """Add loops between submaps, by their numbers, and solve."""
         for loop in loops:
-            if not 0 <= loop.first < loop.second < len(self._anchors):
+            if not 0 <= loop.first < loop.second < len(self.anchors):
                 raise InputError(f"loop: expected two submaps in order, got {loop.first} and {loop.second}")
         if not loops:
             return
-        factors = loop_factors(loops, self._anchors, self.settings.robust_loops)
+        factors = loop_factors(loops, self.anchors, self.settings.robust_loops)
         self.smoother.extend([Given(Additions(factors=factors), "loops")], settings=_AFTER_LOOPS)
         self._loops += loops
 
     def pose(self, k: int) -> FloatArray:
         """The present estimate (4, 4) of a keyframe's pose; in a closed submap it goes along with the anchor."""
         if k < len(self._offsets):
-            number = int(np.searchsorted(self._anchors, k, side="right")) - 1
-            return np.asarray(self._running(self._anchors[number]) @ self._offsets[k])
+            number = int(np.searchsorted(self.anchors, k, side="right")) - 1
+            return np.asarray(self._running(self.anchors[number]) @ self._offsets[k])
         return self._running(k)
 
     def covariance(self) -> FloatArray:
@@ -326,12 +310,12 @@ class SubmapGraph:
 
     def world_T_anchor(self) -> FloatArray:
         """The present estimates (n, 4, 4) of all anchors."""
-        return np.array([self._running(anchor) for anchor in self._anchors])
+        return np.array([self._running(anchor) for anchor in self.anchors])
 
     def poses(self) -> FloatArray:
         """The present estimates (N, 4, 4) of all keyframes."""
         closed = len(self._offsets)
-        of = np.searchsorted(self._anchors, np.arange(closed), side="right") - 1
+        of = np.searchsorted(self.anchors, np.arange(closed), side="right") - 1
         poses = np.empty((len(self), 4, 4))
         poses[:closed] = self.world_T_anchor()[of] @ np.array(self._offsets).reshape(-1, 4, 4)
         for k in range(closed, len(self)):
@@ -346,7 +330,7 @@ class SubmapGraph:
         """Choose the loops that agree, and solve all measurements together."""
         if not len(self):
             raise InputError("expected at least one keyframe before the end")
-        loops = select_loops(self._motions[1:], self._anchors, self._loops)
+        loops = select_loops(self._motions[1:], self.anchors, self._loops)
         graph, landmarks = self.measurements(loops)
         solver = BatchSolver(graph=graph, settings=_SOLVER)
         solution, solved = solver.solve(), solver.graph()
@@ -359,7 +343,7 @@ class SubmapGraph:
         observations of landmarks in it, those confirmed."""
         graph, poses = SceneFactorGraph(), self.poses()
         landmarks = LandmarkObservations(self._confirmed(), self._starts(poses), self.settings.robust)
-        loops = Loops([loop for loop, kept in zip(self._loops, chosen.kept, strict=True) if kept], self._anchors)
+        loops = Loops([loop for loop, kept in zip(self._loops, chosen.kept, strict=True) if kept], self.anchors)
         for k, (time, (moved, covariance)) in enumerate(zip(self._times, self._motions, strict=True)):
             graph.advance(time)
             motion = MeasuredMotion(moved, chosen.inflated(covariance) if k else covariance, poses[k])
@@ -374,15 +358,15 @@ class SubmapGraph:
     def _begin_submap(self, k: int) -> None:
         """Close the running submap, if any, and make the keyframe k an anchor."""
         if k:
-            self._close(self._anchors[-1], k)
-        self._anchors.append(k)
+            self._close(self.anchors[-1], k)
+        self.anchors.append(k)
         self._way = 0.0
 
     def _close(self, anchor: int, successor: int) -> None:
         mine = {n for now in self._seen[anchor:successor] for n, _ in now}
         world = inverse_transform(self._running(anchor))
         self._offsets += [np.eye(4), *(world @ self._running(k) for k in range(anchor + 1, successor))]
-        variables, anchors = self.smoother.graph().variables.values(), set(map(pose_key, self._anchors))
+        variables, anchors = self.smoother.graph().variables.values(), set(map(pose_key, self.anchors))
         old = [one.key for one in variables if one.epoch is not None and one.epoch < successor]
         leaving = [*(key for key in old if key not in anchors), *map(landmark_key, mine)]
         self.smoother.marginalise(leaving, CondensedSubmap(pose_key(anchor), pose_key(successor)))

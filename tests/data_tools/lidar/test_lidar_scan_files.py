@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from benchmarks.scans import SimulatedScans
-from data_tools.lidar import Scan, read_scan, write_cloud
-from data_tools.lidar.scan import load_open3d
-from data_tools.lidar.scan_files import SUFFIXES, relative_times
-from saga_fg.errors import InputError, MissingExtraError
+from data_tools.lidar import SUFFIXES, Scan, load_open3d, read_scan, write_cloud
+from data_tools.lidar.scan_files import relative_times
+from saga_fg import InputError, MissingExtraError
 
 POINTS = np.array([[1.0, 2.0, 3.0], [-4.5, 0.25, -1.75], [10.0, -20.0, 0.5]])
 INTENSITY = np.array([0.0, 0.5, 0.25])
@@ -116,6 +115,8 @@ def test_points_without_a_place_are_dropped_and_counted(tmp_path: Path, subtests
             assert np.isnan(scan.intensity[1])
             assert scan.dropped == 2
     assert scan.time.tolist() == [0.0, 0.03]
+    np.tile(np.array([np.nan, np.nan, np.nan, 0.5], dtype="<f4"), (300, 1)).tofile(tmp_path / "a.bin")
+    assert (len(read_scan(tmp_path / "a.bin")), read_scan(tmp_path / "a.bin").dropped) == (0, 300)
     for suffix in SUFFIXES:
         (tmp_path / f"none{suffix}").write_bytes(b"")
         assert len(read_scan(tmp_path / f"none{suffix}")) == 0

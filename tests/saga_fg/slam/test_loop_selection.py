@@ -22,10 +22,9 @@ from saga_fg.slam.pose_graph import (
     optimise_poses,
     trusted,
 )
-from saga_fg.slam.pose_graph.consensus import chosen_edges
-from saga_fg.slam.pose_graph.optimisation import graph_values
+from saga_fg.slam.pose_graph.optimisation import chosen_edges, graph_values
 from saga_fg.slam.submaps import LoopClosure
-from saga_fg.slam.submaps.loops import LoopSelection, _AnchoredLoops, select_loops
+from saga_fg.slam.submaps.between import LoopSelection, _AnchoredLoops, select_loops
 from tests.saga_fg.loops import with_false_loops
 
 PER_LAP, STEPS, EVERY = 100, 200, 5

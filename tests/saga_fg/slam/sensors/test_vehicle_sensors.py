@@ -11,10 +11,10 @@ import pytest
 from saga_fg import Detections, Frame, InputError
 from saga_fg.estimators import BatchSolver, IncrementalSmoother
 from saga_fg.graph import EGO_BIAS, EGO_POSE
-from saga_fg.numerics.geometry import inverse_transform, yaw_transform
+from saga_fg.numerics import inverse_transform, yaw_transform
 from saga_fg.providers import Gps, Imu, StartSettings, Wheels
 from saga_fg.providers.vehicle_sensors import mounting
-from saga_fg.slam.mapping.mapper import MeasuredMotion
+from saga_fg.slam.mapping import MeasuredMotion
 from saga_fg.slam.sensors import SensorBuffer, SensorConsistency, SensorSettings, sensor_providers
 
 H, PERIOD, GRAVITY = 0.01, 0.2, 9.81

@@ -1,5 +1,0 @@
-"""Maps of landmarks of unknown identity, estimated jointly with the poses."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
