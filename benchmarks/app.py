@@ -8,7 +8,8 @@ from benchmarks.runner import application
 
 NAMES = (
     *("calibration", "conventions", "endurance", "gaps", "geometry", "inertial", "joint", "kills", "labels"),
-    *("landmarks", "loops", "metrics", "pose_graphs", "scaling", "service", "slam", "speed", "streaming", "tracking"),
+    *("landmarks", "loops", "metrics", "pose_graphs", "right_of_way", "scaling", "service", "slam", "speed"),
+    *("streaming", "tracking"),
 )
 
 app = application(getattr(import_module(f"benchmarks.{name}"), name) for name in NAMES)

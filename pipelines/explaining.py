@@ -87,12 +87,16 @@ def read_track(journal: Path, track: str, scene: str | None) -> tuple[list[Event
     if not track.isdecimal() or len(track) > 19:
         raise InputError(f"--track {track[:40]}: expected the number of a track, or SCENE-NUMBER")
     number = int(track)
-    events, clocks = [], []
+    events, clocks, told = [], [], dict[int, float]()
     for event in read_events(journal):
         if event.get("event") == "clocks":
             clocks.append(event)
         elif event.get("track") == number and scene in (None, event.get("scene")):
             events.append(event)
+        elif event.get("event") == "yields" and events and str(event.get("scene")) == str(events[-1].get("scene")):
+            own = {other: p for source, other, p in event["yields"] if source == number}
+            events += [event | {"track": number, "other": k, "p": p} for k, p in own.items() if k not in told]
+            told = own
     if not events:
         where = "" if scene is None else f" of scene {scene}"
         raise InputError(f"{journal}: expected events of track {number}{where}, there are none")
@@ -118,6 +122,18 @@ def read_graphs(journal: Path) -> dict[str, list[Event]]:
         if event.get("event") == "graph":
             graphs.setdefault(str(event.get("scene")), []).append(event)
     return graphs
+
+
+def read_yields(journal: Path) -> dict[str, dict[float, list[list[Any]]]]:
+    """Read who yielded to whom, by scene and time, s: rows of `Yields`; none where there is no journal.
+
+    Raises `InputError` for a broken one.
+    """
+    found: dict[str, dict[float, list[list[Any]]]] = {}
+    for event in read_events(journal) if journal.exists() else ():
+        if event.get("event") == "yields":
+            found.setdefault(str(event.get("scene")), {})[event["time"]] = event["yields"]
+    return found
 
 
 def read_events(journal: Path) -> Iterator[Event]:
@@ -150,6 +166,7 @@ def _story(events: Sequence[Event]) -> list[str]:
         "missed": _missed,
         "deleted": _deleted,
         "unsettled": _unsettled,
+        "yields": _yields,
     }
     lines = [head]
     for event in events:
@@ -196,6 +213,10 @@ def _deleted(event: Event) -> list[str]:
 def _unsettled(event: Event) -> list[str]:
     deviation = " and ".join(f"{d:.2f}" for d in event["deviation"])
     return [f"not settled: the solver found no minimum of the graph; known to {deviation} m, no better than predicted"]
+
+
+def _yields(event: Event) -> list[str]:
+    return [f"yields to track {event['other']}, probability {event['p']:.2f}"]
 
 
 def _split(candidates: Sequence[Event]) -> tuple[Event, list[Event]]:

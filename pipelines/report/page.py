@@ -27,7 +27,7 @@ from data_tools.datasets.source import DatasetSource
 from data_tools.figures import COLOURS, Chart, FigureTable, as_json, class_colours
 from data_tools.files import parsed_json, read_bytes, write_text
 from pipelines.config import load_config
-from pipelines.explaining import clock_table
+from pipelines.explaining import clock_table, journal_of, read_yields
 from pipelines.report.figures import UNSEEN, latency_chart, track_charts, track_figures
 from pipelines.report.scenes import ReportScene, comparisons, scene_data, start_thresholds, thumbnails
 from saga_fg.errors import InputError
@@ -240,6 +240,7 @@ def _with_distinct_names(one: _Result, other: _Result) -> list[_Result]:
 
 def _scenes(source: DatasetSource, result: _Result) -> list[ReportScene]:
     config, predicted = load_config(source.family), read_predictions(result.path)
+    yields = read_yields(journal_of(result.path))
     return [
         ReportScene(
             each.scene,
@@ -248,6 +249,7 @@ def _scenes(source: DatasetSource, result: _Result) -> list[ReportScene]:
             config.tracker.edges,
             config.sensors,
             {result.method: predicted[name]} if name in predicted else {},
+            yields={result.method: yields.get(name, {})},
         )
         for name, each in result.found.scenes.items()
     ]

@@ -162,6 +162,7 @@ class ReportScene:
     sensors   models by name, which place detections in the world
     predictions  by the tracker's name, of its tracks; may be left out
     map       of the place; cameras: thumbnails of images for each moment, by camera
+    yields    by the tracker's name, rows of `saga_fg.types.Yields` by time, s; may be left out
     """
 
     scene: Scene
@@ -172,6 +173,7 @@ class ReportScene:
     predictions: Mapping[str, PredictionRows] = field(default_factory=dict)
     map: AreaMap | None = None
     cameras: Thumbnails = field(default_factory=dict)
+    yields: Mapping[str, Mapping[float, Sequence[Sequence[Any]]]] = field(default_factory=dict)
 
 
 def scene_of_run(
@@ -185,6 +187,7 @@ def scene_of_run(
         rules,
         sensors,
         {name: PredictionRows.from_moments(run.predictions) for name, run in runs.items() if run.predictions},
+        yields={name: {each.timestamp: each.yields.rows() for each in run.tracks} for name, run in runs.items()},
     )
 
 
@@ -209,7 +212,9 @@ def scene_data(report: ReportScene) -> dict[str, Any]:
         "ego": _whole(ego * [100, 100, 1000]),
         "labels": labels.tolist(),
         "methods": {
-            name: _method(table, coasting.get(name), labels, origin, len(scene), report.rules)
+            name: _method(
+                table, coasting.get(name), labels, origin, scene.timestamps, report.rules, report.yields.get(name, {})
+            )
             | predictions_data(report.predictions.get(name), table, scene.timestamps, origin)
             for name, table in report.tracks.items()
         },
@@ -234,8 +239,9 @@ def _method(
     coasting: FloatArray | None,
     labels: StrArray,
     origin: FloatArray,
-    moments: int,
+    times: FloatArray,
     rules: Sequence[EdgeRule],
+    yields: Mapping[float, Sequence[Sequence[Any]]],
 ) -> dict[str, Any]:
     ids, number = np.unique(table.id, return_inverse=True)
     covariance = table.position_covariance
@@ -248,16 +254,32 @@ def _method(
         1000 * (np.full(len(table), np.nan) if coasting is None else coasting),
     ]
     rows = _whole(np.column_stack(columns))
-    starts = np.searchsorted(table.frame, np.arange(moments + 1)).tolist()
+    starts = np.searchsorted(table.frame, np.arange(len(times) + 1)).tolist()
+    edges = edges_of_frames(table, len(times), rules)
+    waiting = yields_data(yields, ids.tolist(), times, len(rules))
     return {
         "ids": ids.tolist(),
         "moments": [rows[a:b] for a, b in pairwise(starts)],
         "edges": [
-            _whole(np.column_stack([number[target], number[source], 1000 * rate, rule]))
-            for target, source, rate, rule in edges_of_frames(table, moments, rules)
+            _whole(np.column_stack([number[target], number[source], 1000 * rate, rule])) + more
+            for (target, source, rate, rule), more in zip(edges, waiting, strict=True)
         ],
-        "relations": relation_names(rules),
+        "relations": [*relation_names(rules), "yields to"],
     }
+
+
+def yields_data(
+    found: Mapping[float, Sequence[Sequence[Any]]], ids: Sequence[str], times: FloatArray, relation: int
+) -> list[Rows]:
+    """Return at each moment which of the tracks yield to which, as edges of the kind `relation`."""
+    number = {id_.rpartition("-")[2]: k for k, id_ in enumerate(ids)}  # nuScenes: SCENE-NUMBER
+    moments: list[Rows] = [[] for _ in times]
+    for time, rows in found.items():
+        k = int(np.searchsorted(times, time - 1e-4))
+        if k < len(times) and times[k] < time + 1e-4:
+            known = ((number.get(str(a)), number.get(str(b)), round(1000 * p), relation) for a, b, p in rows)
+            moments[k] = [list(row) for row in known if None not in row]
+    return moments
 
 
 def comparisons(report: ReportScene, thresholds: Mapping[str, float]) -> list[dict[str, Any]]:

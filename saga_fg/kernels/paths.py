@@ -210,6 +210,32 @@ def trail_paths(
     return place, course, speed, weight, certainty, disagreement
 
 
+@kernel("f3 i1 f f")
+def path_meetings(points: FloatArray, reach: IntArray, near: float, spacing: float) -> tuple[IntArray, IntArray]:
+    """Pairs (E, 2) of paths that come within `near` m of one another, and the points (E, 2) of both where they do.
+
+    Of k paths: points (k, m, 2), at most `spacing` m apart, of which the first `reach` (k,) count. It is the first such
+    point of the first path, and the point of the second one that is nearest to it.
+    """
+    k = len(points)
+    pair, place, found = np.empty((k * k, 2), dtype=np.int64), np.empty((k * k, 2), dtype=np.int64), 0
+    for p in range(k):
+        for q in range(p + 1, k):
+            a, least = 0, math.inf
+            while a < reach[p] and least >= near:
+                b, least, nearest = 0, math.inf, 0
+                while b < reach[q]:
+                    d = math.hypot(points[p, a, 0] - points[q, b, 0], points[p, a, 1] - points[q, b, 1])
+                    if d < least:
+                        least, nearest = d, b
+                    b += max(1, int((d - least) / spacing))  # points that are farther than the nearest one
+                if least < near:
+                    pair[found, 0], pair[found, 1], place[found, 0], place[found, 1] = p, q, a, nearest
+                    found += 1
+                a += max(1, int((least - near) / spacing))
+    return pair[:found], place[:found]
+
+
 Turning = tuple[FloatArray, FloatArray, FloatArray]
 
 

@@ -61,6 +61,7 @@ LANE = 1.8  # m to either side of a lane's middle
 ALIKE = 0.5  # rad
 BEFORE, BEYOND = 40.0, 3.0  # m before a line and beyond it, within which it concerns vehicles
 ONE_LINE = 5.0  # m along the lane, within which halts are at one line
+LIKELY = 0.3  # probability of a halt from which vehicles come to a line
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +91,17 @@ class Lines(Columns):
         """(n, k) whether vehicles are in the lane of each line, and go its way."""
         _, aside = ahead_and_aside(position[:, None] - self.position, unit(self.heading))
         return np.asarray((np.abs(aside) < LANE) & (np.abs(wrap_angle(heading[:, None] - self.heading)) < ALIKE))
+
+    def next_of(self, position: FloatArray, heading: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Distance (n,), m, of vehicles from the line that they come to, infinite: none, and how likely they halt."""
+        if len(self) == 0:
+            return np.full(len(position), np.inf), np.zeros(len(position))
+        ahead = -self.beyond(position)
+        near = self.approached(position, heading) & (ahead < BEFORE) & (ahead > -BEYOND) & (self.probability > LIKELY)
+        distance = np.where(near, ahead, np.inf)
+        nearest, each = distance.argmin(axis=1), np.arange(len(position))
+        found = distance[each, nearest]
+        return found, np.where(np.isfinite(found), self.probability[nearest], 0.0)
 
 
 @dataclass(frozen=True, eq=False)

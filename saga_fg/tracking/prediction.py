@@ -29,13 +29,14 @@ import numpy as np
 
 from saga_fg.kernels.paths import mean_courses
 from saga_fg.model import Curvilinear, KnownCourses, NodeTable, Paths, Unseen, build_graph, turning_time
-from saga_fg.numerics import BoolArray, FloatArray, IntArray, unchecked, wrap_angle
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, of_classes, unchecked, wrap_angle
 from saga_fg.tracking.edge_record import answers
+from saga_fg.tracking.right_of_way import INTERVAL
 from saga_fg.tracking.track_filters import MOVING, TURNING
 from saga_fg.tracking.track_life import reported_rows, untrackable
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.traffic import STEP, paths
-from saga_fg.types import PredictedTracks
+from saga_fg.types import VEHICLES, PredictedTracks
 
 ACROSS = 0.3  # m/s, deviation of the velocity of a vehicle across its path: it moves within its lane
 LEAVING = 1.0  # m/s, where no earlier traffic tells the path: it may turn, or leave its lane
@@ -195,12 +196,20 @@ def _predict_step(state: TrackerState, dt: float, ahead: bool, watched: bool) ->
 
 
 def judge_edges(state: TrackerState) -> None:
-    """Compare what edges said of detected objects with what these did, and let them say it again."""
+    """Compare what edges said of detected objects with what these did, let them say it again, judge right of way."""
     if state.settings.edge_prior == 1 or not any(answers(rule) for rule in state.rules):
         return
     nodes, seen, time = node_table(state), state.table.coasting(state.time) <= SEEN, state.time
     state.halting = state.halting.later(nodes, seen, time)
     state.edge_record = state.edge_record.later(state.rules, nodes, seen, time)
+    if state.right_of_way.due(time):
+        table = state.table
+        able = seen & table.confirmed & of_classes(table.label, VEHICLES)
+        unmoved = np.flatnonzero(able & ~table.has_moved)
+        place = nodes.position[unmoved] + state.origin
+        able[unmoved] = ~state.traffic.passes_beside(table.box.yaw[unmoved], place)  # else it is parked
+        paths = predicted_paths(state, able, INTERVAL)
+        state.right_of_way = state.right_of_way.later(nodes, paths, state.halting.lines, time)
 
 
 def _predict_stationarity(state: TrackerState, dt: float) -> FloatArray | None:

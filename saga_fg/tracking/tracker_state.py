@@ -33,6 +33,7 @@ from saga_fg.tracking.identities import Encounters, GivenIdentities, exchanged
 from saga_fg.tracking.joint_state import JointTrackState, moved_to_present, past_position
 from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
 from saga_fg.tracking.measurements import EgoNode, SensorNoise
+from saga_fg.tracking.right_of_way import RightOfWay
 from saga_fg.tracking.traffic import Traffic, speed_prior
 from saga_fg.types import MAP_CLASSES, Boxes, Frame, class_values
 
@@ -52,6 +53,7 @@ class TrackerSnapshot:
     graph         scene graph of the latest interval, None before the first
     edge_record   how well edges have predicted
     halting       where vehicles halt with nobody before them
+    right_of_way  who yields to whom
     encounters    pairs of tracks that may have exchanged their objects
     start         time from which all others in here are counted, s
     time          of the state, s
@@ -74,6 +76,7 @@ class TrackerSnapshot:
     graph: SceneGraph | None
     edge_record: EdgeRecord
     halting: HaltingPlaces
+    right_of_way: RightOfWay
     encounters: Encounters
     start: float
     time: float
@@ -127,6 +130,7 @@ class TrackerState:
         self.map_nodes, self.ego = MapNodes(settings.signals, read), EgoNode.from_settings(settings)
         self.traffic = Traffic(settings.traffic)
         self.edge_record, self.halting, self.encounters = EdgeRecord(), HaltingPlaces(), Encounters.empty()
+        self.right_of_way = RightOfWay()
         self.identities = GivenIdentities()
 
     def __len__(self) -> int:
@@ -187,6 +191,7 @@ class TrackerState:
         self.identities = self.identities.exchanged(a, b)
         self.traffic.exchange(a, b, since)
         self.edge_record, self.halting = self.edge_record.without({a, b}), self.halting.without({a, b})
+        self.right_of_way = self.right_of_way.without({a, b})
         drivers = self.map_nodes.drivers
         self.map_nodes.drivers = drivers.select(~np.isin(drivers.id, [a, b]))
         return order

@@ -45,7 +45,7 @@ from saga_fg.errors import InputError
 from saga_fg.kernels.components import speeds_ahead
 from saga_fg.kernels.paths import points_by_cell, trail_paths
 from saga_fg.kernels.tracks import prior_of_traffic
-from saga_fg.model import Paths
+from saga_fg.model import Paths, ahead_and_aside, unit
 from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, common_numbers, shallow_copy
 from saga_fg.settings import NonNegative, PositiveOrInf, Settings, setting, settings_group
 from saga_fg.tracking.identities import exchanged
@@ -53,6 +53,7 @@ from saga_fg.tracking.track_filters import Kinematics
 from saga_fg.types import Lane
 
 SPACING = 2.0  # m between the passages of a track
+BESIDE = 5.0  # m, of traffic that passes who is parked
 FIRST_LANE = -2  # ids of lanes count down from here, so that they are never those of tracks
 
 
@@ -265,6 +266,14 @@ class Traffic:
         self.lanes = Trails(Passages.concatenate([points, *parts]))
         self._known = {**self._known, **{lane.name: (k, lane) for k, lane in zip(ids, new, strict=True)}}
         self._next_lane -= len(new)
+
+    def passes_beside(self, heading: FloatArray, position: FloatArray) -> BoolArray:
+        """Whether traffic of a heading (n,), rad, has passed beside places (n, 2), world, m, and none through them."""
+        points = self.trails().points
+        ahead, aside = ahead_and_aside(points.position - position[:, None], unit(heading)[:, None])
+        alike = (np.abs(ahead) < SPACING) & (np.cos(points.heading - heading[:, None]) > np.cos(TURN))
+        nearest = np.where(alike, np.abs(aside), np.inf).min(axis=1, initial=np.inf)
+        return np.asarray((nearest > self.settings.reach) & (nearest < BESIDE))
 
     def trails(self) -> Trails:
         """The passages of those that move."""

@@ -97,6 +97,37 @@ class Track:
 
 
 @dataclass(frozen=True, eq=False)
+class Yields:
+    """R pairs of tracks of one moment, of which one yields to the other where their paths meet.
+
+    source, target  (R,) ids: `source` waits for `target`, or is about to
+    probability     (R,) from 0 to 1
+    """
+
+    source: IntArray
+    target: IntArray
+    probability: FloatArray
+
+    @classmethod
+    def of_pairs(cls, pairs: Mapping[tuple[int, int], float]) -> Self:
+        """From the probability of each pair of ids."""
+        ids = np.array(list(pairs), dtype=np.int64).reshape(-1, 2)
+        return cls(ids[:, 0], ids[:, 1], np.array(list(pairs.values()), dtype=np.float64))
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def between(self, ids: IntArray) -> Self:
+        """Those of which both tracks are among the `ids` (n,)."""
+        kept = np.isin(self.source, ids) & np.isin(self.target, ids)
+        return type(self)(self.source[kept], self.target[kept], self.probability[kept])
+
+    def rows(self) -> list[tuple[int, int, float]]:
+        """Source, target and probability of each, as plain values."""
+        return list(zip(self.source.tolist(), self.target.tolist(), self.probability.tolist(), strict=True))
+
+
+@dataclass(frozen=True, eq=False)
 class Tracks(Columns):
     """All tracks of one moment, as columns, in world coordinates.
 
@@ -109,6 +140,7 @@ class Tracks(Columns):
     coasting             (N,)       seconds since the last detection, 0 when just updated
     settled              (N,)       False where the solver found no minimum of a nonlinear graph: the covariance is then
                                     not smaller than the predicted one; True for all if left out
+    yields                          who yields to whom; none if left out
     """
 
     timestamp: float
@@ -119,6 +151,13 @@ class Tracks(Columns):
     velocity_covariance: FloatArray
     coasting: FloatArray
     settled: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
+    yields: Yields = field(default_factory=lambda: Yields.of_pairs({}))
+
+    def _rows(self, rows: Any) -> Self:
+        """Some tracks, and who of them yields to whom."""
+        chosen = super()._rows(rows)
+        vars(chosen)["yields"] = self.yields.between(chosen.id)
+        return chosen
 
     def __post_init__(self) -> None:
         n = len(self.boxes)

@@ -1,6 +1,7 @@
 """`saga-fg explain` and `saga-fg predict`."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,13 @@ import pytest
 from data_tools.datasets.detection_files import PREDICTION_COLUMNS, PredictionRows, predictions_path, read_predictions
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.config import load_config
+from pipelines.explaining import journal_of, read_track, read_yields, story
 from pipelines.report import Report, report_page, scene_of_run
-from pipelines.report.scenes import scene_data
+from pipelines.report.scenes import scene_data, yields_data
+from pipelines.serving.messages import tracks_message
 from pipelines.tracking import TrackedScene, track_scene
-from saga_fg import InputError
+from saga_fg import InputError, Tracks
+from saga_fg.types import Yields
 from tests.pipelines.command import done, refused, saga_fg
 from tests.pipelines.page_in_browser import tried_in_browser
 
@@ -85,6 +89,27 @@ def test_an_event_that_nobody_wrote(folder, tmp_path):
             f"error: {tmp_path / 't.csv.journal.jsonl'}: expected events as --explain writes"
         )
         assert result.stdout == ""
+
+
+def test_who_yields_is_told_in_answers_stories_and_pages(tmp_path):
+    tracks = replace(Tracks.empty(3.0), yields=Yields.of_pairs({(1, 2): 0.75}))
+    assert tracks_message(tracks)["yields"] == [{"source": 1, "target": 2, "probability": 0.75}]
+    assert "yields" not in tracks_message(Tracks.empty(3.0))
+    journal = journal_of(tmp_path / "t.csv")
+    about = {"scene": "a", "sensor": "lidar", "track": 1, "label": "car"}
+    initiated = about | {"event": "initiated", "time": 0.0, "detection": 0, "probability": 0.9}
+    initiated |= {"least_probability": 0.1, "nearest_tracks": [], "gate": 9.0}
+    told = {"scene": "a", "event": "yields", "sensor": "lidar"}
+    moments = ([[1, 2, 0.75]], [[1, 2, 0.8]], [])
+    events = [initiated, *(told | {"time": 0.1 * k, "yields": rows} for k, rows in enumerate(moments, 1))]
+    journal.write_text("\n".join(map(json.dumps, events)))
+    lines = story(read_track(journal, "1", None)[0])
+    assert [line.split("lidar")[1].strip() for line in lines if "yields" in line] == [
+        "yields to track 2, probability 0.75"
+    ]
+    assert read_yields(journal)["a"][0.1] == [[1, 2, 0.75]]
+    shown = yields_data(read_yields(journal)["a"] | {0.5: [[1, 9, 0.7]]}, ["1", "2"], np.array([0.1, 0.5]), 3)
+    assert shown == [[[0, 1, 750, 3]], []]  # nobody has the number 9
 
 
 def test_what_keeps_no_journal(folder, tmp_path):

@@ -1,0 +1,200 @@
+"""Right of way: who waits for whom where paths cross or come together.
+
+Vehicles in view go on along their paths (`saga_fg.tracking.prediction`), which follow the trails of earlier traffic and
+the lanes of the map. Two meet where a point of one path is within `NEAR` m of the other path, at its first such point,
+unless one is behind the other there or they pass head on. A vehicle waits at the place where earlier traffic halted
+before that point (`saga_fg.tracking.edge_record`), else `CROSSING` or `JOINING` m before it, and has arrived
+`ARRIVES` m before this line.
+
+For each ordered pair i, j the evidence e (`evidence`) holds distances, speeds, times, who leads, where traffic halts
+and the order of arrival. The probability that i yields to j is
+
+    p = 1 / ( 1 + exp(-z) ),   z = w tanh(V [e, 1]) + w_0
+
+smoothed over `SMOOTHING` s. V, w are fitted to simulated crossings and merges of known rules, by
+`python -m benchmarks right-of-way --fit`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, Self
+
+import numpy as np
+from scipy.special import expit
+
+from saga_fg.kernels.paths import path_meetings
+from saga_fg.model import NodeTable, Paths, unit
+from saga_fg.numerics import FloatArray, IntArray
+from saga_fg.tracking.edge_record import Lines
+from saga_fg.tracking.right_of_way_weights import HIDDEN, OUT
+from saga_fg.tracking.traffic import STEP as PATH_STEP
+from saga_fg.types import Yields
+
+INTERVAL = 0.2  # s between two judgements
+LEAST = 0.7  # probability from which it is told that one yields
+SMOOTHING = 0.3  # s, of probabilities
+SPEED_SMOOTHING = 0.5  # s, of changes of speed
+SPACING, BEHIND = 1.0, 5  # m between points of a path, and how many of them are behind the vehicle's middle
+NEAR = 1.5  # m between paths that meet
+ALIKE, HEAD_ON = 0.8, -0.9  # cosine between courses that come together, and of those that pass head on
+LOOKS, AHEAD, FARTHEST = 25.0, 5.0, 60.0  # m, and s, for which paths are followed, to so many m
+CROSSING, JOINING = 5.0, 20.0  # m before a meeting point, where vehicles wait at unknown lines
+ARRIVES, SOON = 4.0, 0.5  # m before the line; s, in which a vehicle arrives at the earliest that has not
+GOES, CRUISE, SLOW = 1.8, 10.0, 2.0  # m/s^2 and m/s of a vehicle that goes on freely; m/s
+
+Pair = tuple[int, int]
+
+
+class Meetings(NamedTuple):
+    """E ordered pairs of vehicles whose paths meet: rows (E, 2); way (E, 2), m, from the middle of each to the point;
+    cosine (E,) between their courses there."""
+
+    rows: IntArray
+    way: FloatArray
+    cosine: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class RightOfWay:
+    """Right of way between vehicles, and what is remembered of them.
+
+    time         of the latest judgement, s
+    motion       speed, m/s, and acceleration, m/s^2, of vehicles, by id
+    arrived      when they have arrived, s, by id
+    probability  that the first of two yields to the second, by ids
+    """
+
+    time: float = -math.inf
+    motion: Mapping[int, tuple[float, float]] = field(default_factory=dict)
+    arrived: Mapping[int, float] = field(default_factory=dict)
+    probability: Mapping[Pair, float] = field(default_factory=dict)
+
+    def due(self, time: float) -> bool:
+        """True if it is time for another judgement."""
+        return time - self.time >= INTERVAL - 1e-6
+
+    def without(self, nodes: set[int]) -> Self:
+        """Without what is known of some vehicles."""
+        motion = {node: one for node, one in self.motion.items() if node not in nodes}
+        arrived = {node: then for node, then in self.arrived.items() if node not in nodes}
+        probability = {pair: p for pair, p in self.probability.items() if nodes.isdisjoint(pair)}
+        return replace(self, motion=motion, arrived=arrived, probability=probability)
+
+    def yields(self, ids: IntArray) -> Yields:
+        """Who yields to whom, among the tracks `ids` (n,)."""
+        return Yields.of_pairs({pair: p for pair, p in self.probability.items() if p >= LEAST}).between(ids)
+
+    def later(self, nodes: NodeTable, paths: Paths, lines: Lines, time: float) -> Self:
+        """After a judgement of the vehicles that have `paths`; see `observed`."""
+        known, pairs, found = self.observed(nodes, paths, lines, time)
+        kept = math.exp((self.time - time) / SMOOTHING)
+        now = yielding(found)
+        smoothed = {
+            pair: p if (before := self.probability.get(pair)) is None else kept * before + (1 - kept) * p
+            for pair, p in zip(pairs, now.tolist(), strict=True)
+        }
+        return replace(known, probability=smoothed)
+
+    def observed(
+        self, nodes: NodeTable, paths: Paths, lines: Lines, time: float
+    ) -> tuple[Self, list[Pair], FloatArray]:
+        """What is remembered at a `time`, s, the pairs of vehicles that meet, by id, and their evidence (E, F).
+
+        lines  where earlier traffic halted
+        """
+        rows, heading = paths.row, nodes.heading[paths.row]
+        ids, half = nodes.id[rows].tolist(), nodes.length[rows] / 2
+        speed = np.maximum(np.einsum("ni,ni->n", nodes.velocity[rows], unit(heading)), 0.0)
+        motion = self._motion(ids, speed.tolist(), time)
+        meetings, lead = _meetings(paths, nodes.position[rows], heading, speed)
+        to_line, halts = lines.next_of(nodes.position[rows], heading)
+        usual = np.full(len(rows), np.inf)
+        before = meetings.way - half[meetings.rows] - np.where(meetings.cosine > ALIKE, JOINING, CROSSING)[:, None]
+        np.minimum.at(usual, meetings.rows, before)
+        to_line = np.where(np.isfinite(to_line), to_line, usual)
+        near = {node: d for node, d in zip(ids, to_line.tolist(), strict=True) if d <= LOOKS}
+        arrived = {
+            node: self.arrived.get(node, time) for node, d in near.items() if d < ARRIVES or node in self.arrived
+        }
+        comes = time + np.maximum((to_line - ARRIVES) / np.maximum(speed, SLOW), SOON)
+        arrival = np.minimum(comes, [arrived.get(node, math.inf) for node in ids])
+        acceleration = np.array([motion[node][1] for node in ids])
+        columns = np.column_stack([half, speed, acceleration, to_line, halts, lead, arrival])
+        pairs = [(ids[i], ids[j]) for i, j in meetings.rows.tolist()]
+        return type(self)(time, motion, arrived), pairs, _evidence(meetings, columns)
+
+    def _motion(self, ids: list[int], speed: list[float], time: float) -> dict[int, tuple[float, float]]:
+        """Speed and smoothed acceleration of vehicles, by id."""
+        dt, kept = time - self.time, math.exp((self.time - time) / SPEED_SMOOTHING)
+        known = {node: self.motion[node] for node in ids if node in self.motion}
+        changes = ((v - known[node][0]) / dt if node in known else 0.0 for node, v in zip(ids, speed, strict=True))
+        return {
+            node: (v, kept * known.get(node, (v, 0.0))[1] + (1 - kept) * a)
+            for node, v, a in zip(ids, speed, changes, strict=True)
+        }
+
+
+def yielding(evidence: FloatArray) -> FloatArray:
+    """The probability (E,) that the first of each pair yields to the second, by the evidence (E, F)."""
+    hidden = np.tanh(evidence @ HIDDEN[:-1] + HIDDEN[-1])
+    return np.asarray(expit(hidden @ OUT[:-1] + OUT[-1]))
+
+
+def free_time(distance: FloatArray, speed: FloatArray) -> FloatArray:
+    """Time, s, in which vehicles of a speed, m/s, go a distance, m, if they speed up to `CRUISE` freely."""
+    distance, top = np.maximum(distance, 0.0), np.maximum(speed, CRUISE)
+    until = (top**2 - speed**2) / (2 * GOES)
+    quick = (np.sqrt(speed**2 + 2 * GOES * distance) - speed) / GOES
+    return np.where(distance <= until, quick, (top - speed) / GOES + (distance - until) / top)
+
+
+def _meetings(
+    paths: Paths, position: FloatArray, heading: FloatArray, speed: FloatArray
+) -> tuple[Meetings, FloatArray]:
+    """Where vehicles meet, each pair in both orders, and the distance (k,), m, to the next one before each."""
+    step = np.arange(0.0, 1.0, SPACING / PATH_STEP)[:, None]
+    begin, piece = paths.position[:, :-1, None], np.diff(paths.position, axis=1)[:, :, None]
+    onward = (begin + step * piece).reshape(len(paths), begin.shape[1] * len(step), 2)
+    behind = position[:, None] + SPACING * np.arange(-BEHIND, 0)[:, None] * unit(heading)[:, None]
+    points = np.concatenate([behind, onward], axis=1)
+    course = np.repeat(paths.heading[:, 1:], len(step), axis=1)
+    course = np.concatenate([np.repeat(heading[:, None], BEHIND, axis=1), course], axis=1)
+    reach = (np.minimum(LOOKS + AHEAD * speed, FARTHEST) / SPACING).astype(np.int64) + BEHIND
+    pair, at = path_meetings(points, reach, NEAR, SPACING)
+    way, angle = SPACING * (at - BEHIND), course[pair, at]
+    cosine = np.cos(angle[:, 0] - angle[:, 1])
+    lead, begins = np.full(len(paths), np.inf), way <= SPACING
+    in_line = (cosine > ALIKE) & begins.any(axis=1)
+    own = np.where(begins[:, 0], 1, 0)[in_line]
+    each = np.arange(len(own))
+    gap = way[in_line][each, own] - way[in_line][each, 1 - own]
+    follows = gap > 0
+    np.minimum.at(lead, pair[in_line][each, own][follows], gap[follows])
+    met = np.flatnonzero(~in_line & (cosine > HEAD_ON))
+    rows, ways = (np.concatenate([each[met], each[met, ::-1]]) for each in (pair, way))
+    return Meetings(rows, ways, np.tile(cosine[met], 2)), lead
+
+
+def _evidence(meetings: Meetings, columns: FloatArray) -> FloatArray:
+    """(E, F) evidence on pairs i, j, of order one, by half lengths, speeds and so on (k, 7) of vehicles."""
+    half, speed, acceleration, to_line, halts, lead, arrival = np.moveaxis(columns[meetings.rows], 2, 0)
+    front, later = meetings.way - half, np.clip(arrival[:, 0] - arrival[:, 1], -3.0, 3.0)
+    comes = np.maximum(front, 0.0) / np.maximum(speed, SLOW)
+    braking = speed**2 / (8 * np.maximum(to_line, 0.3))
+    both = (
+        np.clip(front, -5.0, 50.0) / 20,
+        np.clip(meetings.way + half, -4.0, 8.0) / 4,
+        np.clip(to_line, -6.0, 40.0) / 15,
+        speed / 8,
+        np.clip(acceleration, -3.0, 3.0) / 2,
+        np.minimum(free_time(front, speed), 10.0) / 4,
+        np.minimum(comes, 10.0) / 4,
+        np.minimum(braking, 2.0),
+        np.clip(lead - np.maximum(to_line, 0.0) - 2, -8.0, 4.0) / 6,
+        np.clip(lead - meetings.way, -8.0, 8.0) / 8,
+        halts,
+    )
+    return np.column_stack([*both, meetings.cosine > ALIKE, meetings.cosine, np.tanh(2 * later), later / 2])

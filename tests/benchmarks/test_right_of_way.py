@@ -1,0 +1,60 @@
+"""Simulated crossings and merges under a known rule, and what the tracker says of them."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmarks.crossings import CrossingWorld, Rule, build_crossing, crossing_scene
+from benchmarks.right_of_way import Told
+
+RULES: tuple[Rule, ...] = ("all_way_stop", "priority_road", "cone_merge")
+
+
+@cache
+def crossing(rule: Rule) -> CrossingWorld:
+    return build_crossing(rule, 1, duration=40.0)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_vehicles_under_a_rule_wait_and_do_not_collide(rule):
+    here = crossing(rule)
+    n = here.yields.shape[1]
+    place = np.where(here.objects.present[:, :n, None], here.objects.position[:, :n], np.nan)
+    away = np.linalg.norm(place[::10, :, None] - place[::10, None], axis=-1)
+    away[:, np.arange(n), np.arange(n)] = np.inf
+    assert np.nanmin(away) > 1.5
+    assert here.yields.any()
+    assert not (here.yields & ~here.meet).any()
+    assert not here.yields[:, np.arange(n), np.arange(n)].any()
+    cones = here.objects.label == "traffic_cone"
+    assert cones.any() == (rule == "cone_merge")
+
+
+def test_all_halt_at_an_all_way_stop():
+    here = crossing("all_way_stop")
+    speed = np.linalg.norm(here.objects.velocity, axis=-1)
+    before = np.linalg.norm(here.objects.position, axis=-1)
+    near = here.objects.present & (before < 14) & (before > 7)
+    through = (here.objects.present & (before > 40)).any(axis=0) & (here.objects.present & (before < 5)).any(axis=0)
+    first = here.objects.present.argmax(axis=0)
+    through &= before[first, np.arange(len(first))] > 20  # the others may have halted before
+    assert through.sum() >= 3
+    for k in np.flatnonzero(through):
+        assert speed[near[:, k], k].min() < 1.0
+
+
+def test_a_crossing_is_the_same_for_the_same_seed():
+    one, other = (crossing_scene(build_crossing("priority_road", 4, duration=2.0, warm_up=5.0), 4) for _ in range(2))
+    assert len(one.frames) == 20
+    for a, b in zip(one.frames, other.frames, strict=True):
+        assert np.array_equal(a.detections.boxes.position, b.detections.boxes.position)
+
+
+def test_figures_of_pairs_and_moments():
+    told = Told()
+    for _ in range(10):
+        told.add(0, {(1, 2), (3, 4)}, {(1, 2), (5, 6)}, 0.1)
+    figures = told.figures()
+    assert (figures["true pairs"], figures["told pairs"]) == (2, 2)
+    assert figures["precision"] == figures["recall"] == figures["precision of moments"] == 0.5

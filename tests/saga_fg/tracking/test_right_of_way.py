@@ -1,0 +1,195 @@
+"""Who yields to whom, from paths of earlier traffic, places of halts, order of arrival and what vehicles do."""
+
+import numpy as np
+import pytest
+
+from saga_fg import Boxes, Detections, Frame, Tracker, TrackerSettings
+from saga_fg.kernels.paths import path_meetings
+from saga_fg.model import NodeTable
+from saga_fg.tracking.edge_record import Lines
+from saga_fg.tracking.right_of_way import RightOfWay, free_time, yielding
+from saga_fg.tracking.table_tracking import dense_traffic_settings
+from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings, paths
+from saga_fg.types import RoadMap, StopLine, TrafficLight
+
+EAST, NORTH = 0.0, np.pi / 2
+NOBODY_HALTS = Lines.none()
+HALTS_IN_THE_SOUTH = Lines(np.array([[0.0, -8.0]]), np.array([NORTH]), np.array([8.0]), np.array([0.0]))
+
+
+def memory(*lines):
+    """Traffic that has passed every 2 m along lines (start, heading) of 60 m."""
+    traffic = Traffic(TrafficSettings(memory=600.0))
+    s = np.arange(0.0, 60.0, 2.0)
+    parts = []
+    for number, (start, heading) in enumerate(lines):
+        u, n = np.array([np.cos(heading), np.sin(heading)]), len(s)
+        zero = np.zeros(n)
+        parts.append(
+            Passages(
+                id=np.full(n, 1000 + number),
+                label=np.full(n, "car"),
+                position=np.asarray(start) + s[:, None] * u,
+                heading=np.full(n, heading),
+                speed=zero + 8,
+                variance=zero + 1,
+                stationary=zero,
+                time=s / 8,
+                moves=np.ones(n, dtype=bool),
+            )
+        )
+    traffic.left = Passages.concatenate([Passages.empty(), *parts])
+    return traffic
+
+
+CROSSING = memory(((-30, 0), EAST), ((0, -30), NORTH))
+
+
+def judged(moments, traffic=CROSSING, lines=NOBODY_HALTS):
+    """What is known after moments of (x, y, heading, speed) of vehicles 1, 2, ..., .2 s apart."""
+    known = RightOfWay()
+    for number, vehicles in enumerate(moments):
+        x, y, heading, speed = np.array(vehicles, dtype=float).T
+        k, place = len(x), np.column_stack([x, y])
+        velocity = speed[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
+        ids, label = np.arange(1, k + 1), np.full(k, "car")
+        nodes = NodeTable(ids, label, (), place, velocity, heading, np.full(k, 4.5), np.full(k, 0.04))
+        ways = paths(traffic, ids, place, heading, np.zeros(k), np.full((k, 2), 0.5), 20)
+        known = known.later(nodes, ways, lines, 0.2 * number)
+    return known
+
+
+def told(known):
+    return {(a, b) for a, b, _ in known.yields(np.arange(1, 10)).rows()}
+
+
+def waiting_in_the_south(other_x, speed, moments=15):
+    """Vehicle 1 stands before the crossing, vehicle 2 comes from the west."""
+    return [[(0, -8.0, NORTH, 0.0), (other_x + 0.2 * k * speed, 0, EAST, speed)] for k in range(moments)]
+
+
+def test_who_waits_where_traffic_halts_yields_to_who_comes():
+    known = judged(waiting_in_the_south(-34.0, 8.0), lines=HALTS_IN_THE_SOUTH)
+    assert told(known) == {(1, 2)}
+    assert all(0.0 <= p <= 1.0 for p in known.probability.values())
+
+
+def test_nobody_yields_to_who_has_left():
+    assert told(judged(waiting_in_the_south(20.0, 8.0), lines=HALTS_IN_THE_SOUTH)) == set()
+
+
+def test_a_follower_does_not_yield_to_its_leader():
+    line = [[(-20 + 1.6 * k, 0, EAST, 8.0), (-8 + 1.6 * k, 0, EAST, 8.0)] for k in range(10)]
+    assert judged(line).probability == {}
+
+
+def test_oncoming_vehicles_do_not_meet():
+    traffic = memory(((-30, 0), EAST), ((30, 3.5), np.pi))
+    moments = [[(-20 + 1.6 * k, 0, EAST, 8.0), (20 - 1.6 * k, 3.5, np.pi, 8.0)] for k in range(10)]
+    assert judged(moments, traffic).probability == {}
+
+
+def test_where_nobody_ever_stops_lines_tell_nothing():
+    distance, halts = NOBODY_HALTS.next_of(np.zeros((2, 2)), np.zeros(2))
+    assert np.isinf(distance).all()
+    assert (halts == 0).all()
+    moments = [[(-40 + 1.6 * k, 0, EAST, 8.0), (0, -60 + 1.6 * k, NORTH, 8.0)] for k in range(10)]
+    assert all(0.0 <= p <= 1.0 for p in judged(moments).probability.values())
+
+
+def test_the_next_line_is_that_of_ones_own_lane_and_direction():
+    position, heading = np.array([[0.5, -20.0], [0.0, 8.0], [5.0, -20.0], [0.0, -20.0]]), [NORTH, NORTH, NORTH, EAST]
+    distance, halts = HALTS_IN_THE_SOUTH.next_of(position, np.array(heading))
+    assert distance.tolist() == pytest.approx([12.0, np.inf, np.inf, np.inf])
+    assert (halts > 0).tolist() == [True, False, False, False]
+
+
+def test_order_of_vehicles_does_not_matter():
+    moments = waiting_in_the_south(-34.0, 8.0)
+    one = judged(moments, lines=HALTS_IN_THE_SOUTH).probability
+    other = judged([vehicles[::-1] for vehicles in moments], lines=HALTS_IN_THE_SOUTH).probability
+    assert other[2, 1] == pytest.approx(one[1, 2], abs=0.1)  # the meeting point is found to a step of the path
+
+
+def test_what_is_known_of_a_vehicle_is_forgotten_with_it():
+    known = judged(waiting_in_the_south(-34.0, 8.0)).without({1})
+    assert known.motion.keys() == {2}
+    assert known.probability == {}
+
+
+def test_paths_that_cross_a_hundred_times_meet_once():
+    x = np.arange(0.0, 202.0, 0.5)
+    wave = np.sin(np.pi * x / 2)
+    points = np.stack([np.column_stack([x, wave]), np.column_stack([x, -wave])])
+    pair, place = path_meetings(points, np.full(2, len(x)), 0.1, 2.0)
+    assert pair.tolist() == [[0, 1]]
+    assert place.tolist() == [[0, 0]]
+
+
+def test_meetings_are_those_of_all_distances():
+    rng = np.random.default_rng(3)
+    points = np.cumsum(rng.uniform(-0.7, 0.7, (12, 40, 2)), axis=1) + rng.uniform(-5, 5, (12, 1, 2))
+    reach = rng.integers(5, 40, 12)
+    pair, place = path_meetings(points, reach, 0.5, 1.0)
+    expected = {}
+    for p in range(12):
+        for q in range(p + 1, 12):
+            away = np.linalg.norm(points[p, : reach[p], None] - points[q, : reach[q]], axis=-1)
+            near = np.flatnonzero(away.min(axis=1) < 0.5)
+            if len(near):
+                expected[p, q] = [near[0], away[near[0]].argmin()]
+    assert {tuple(each): list(at) for each, at in zip(pair.tolist(), place, strict=True)} == expected
+
+
+def test_free_time_is_that_of_an_even_acceleration_up_to_the_cruising_speed():
+    assert free_time(np.array([0.9, -3.0, 20.0]), np.array([0.0, 5.0, 10.0])).tolist() == pytest.approx([1.0, 0.0, 2.0])
+
+
+def test_probabilities_are_finite_for_extreme_evidence():
+    p = yielding(np.vstack([np.full(26, 1e6), np.full(26, -1e6), np.zeros(26)]))
+    assert ((p >= 0) & (p <= 1)).all()
+
+
+def frames(count=12, **more):
+    """Four vehicles pass from the west, then two meet; a third one is parked beside the road all the time."""
+    for k in range(count):
+        position = [[-20 + 0.8 * k, 0, 0.8], [0, -20 + 0.6 * k, 0.8], [-6, -4.5, 0.8]]
+        size, velocity = [[4.5, 1.8, 1.6]] * 3, [[np.nan, np.nan]] * 3
+        boxes = Boxes.of(["car"] * 3, position, size, [EAST, NORTH, EAST], velocity)
+        yield Frame(0.1 * k, "lidar", Detections(boxes, np.array([0.9, 0.9, 0.9])), **more)
+
+
+def test_without_edges_that_answer_for_themselves_nobody_is_told_to_yield():
+    tracker = Tracker(TrackerSettings())
+    assert all(len(tracker.step(frame).yields) == 0 for frame in frames())
+
+
+def test_a_parked_car_takes_no_part():
+    tracker = Tracker(dense_traffic_settings())
+    for frame in frames(30):
+        tracks = tracker.step(frame)
+    parked = tracks.id[np.argmin(np.hypot(*(tracks.boxes.position[:, :2] - [-6, -4.5]).T))]
+    pairs = tracker.snapshot().right_of_way.probability
+    assert pairs
+    assert not any(parked in pair for pair in pairs)
+
+
+def test_a_stop_line_across_no_lane_changes_nothing():
+    alone = RoadMap(
+        (TrafficLight("none", (52.0, 52.0)),), (StopLine("nowhere", (50.0, 50.0), (54.0, 50.0), "none"),), ()
+    )
+    plain, mapped = Tracker(dense_traffic_settings()), Tracker(dense_traffic_settings())
+    for one, other in zip(frames(), frames(road_map=alone), strict=True):
+        a, b = plain.step(one), mapped.step(other)
+        assert np.array_equal(a.boxes.position, b.boxes.position)
+        assert a.yields.rows() == b.yields.rows()
+
+
+def test_who_yields_goes_with_the_tracks_and_through_a_snapshot():
+    tracker = Tracker(dense_traffic_settings())
+    for frame in frames(20):
+        tracks = tracker.step(frame)
+    assert len(tracks.select(tracks.id == tracks.id[0]).yields) == 0
+    other = Tracker(dense_traffic_settings())
+    other.restore(tracker.snapshot())
+    assert other.snapshot().right_of_way.probability == tracker.snapshot().right_of_way.probability
