@@ -154,7 +154,8 @@ def all_known(state):
     known = {}
     for row, track in enumerate(state.table.id.tolist()):
         of = np.array([track])
-        modes = [column for t in state.joint._modes.values() for column in t.select(t.ids == track)._columns[1:]]
+        tables = [t.select(t.ids == track) for t in state.joint._modes.values()]
+        modes = [column for t in tables for column in (t.weight, t.mean, t.P, t.shift, t.spread)]
         table = replace(state.table.select(np.array([row])), id=of[:0])
         parts = (table, table.box, table.stationarity, table.turn, table.sensors)
         columns = [c for part in parts for c in vars(part).values() if isinstance(c, np.ndarray)]
