@@ -50,6 +50,7 @@ PACKAGES = ("saga_fg", "factors")
 METHODS = ("residual", "jacobians", "residual_jacobians")
 KINDS = "biufU"  # of arrays: truth values, integers, floating point numbers, texts
 ALIGNMENT = 8
+MAX_DIMENSIONS = 8  # of an array; compiled functions take no more than some dozens
 
 
 class TreeWriter:
@@ -164,8 +165,10 @@ def _at(values: list[Any], place: Any) -> Any:
 def _read_array(
     dtype: np.dtype[Any], shape: tuple[int, ...], order: Any, writeable: bool, start: int, arrays: bytes
 ) -> np.ndarray[Any, Any]:
-    if dtype.kind not in KINDS or any(type(n) is not int or n < 0 for n in shape) or order not in ("C", "F"):
-        raise InputError(f"state: expected an array of numbers, truth values or texts, got {dtype} {shape} {order}")
+    sizes = len(shape) <= MAX_DIMENSIONS and all(type(n) is int and n >= 0 for n in shape)
+    if dtype.kind not in KINDS or not sizes or order not in ("C", "F"):
+        text = f"{dtype} {shape} {order}"[:80]
+        raise InputError(f"state: expected an array of numbers, truth values or texts, got {text}")
     count = math.prod(shape)
     if start < 0 or start + count * dtype.itemsize > len(arrays):
         raise InputError(f"state: expected {count * dtype.itemsize} bytes of an array, the file ends before")

@@ -249,6 +249,7 @@ def test_values_that_no_service_writes_are_refused(tmp_path, subtests):
     labels = next(node["array"] for node in json.loads(nodes) if "array" in node and node["array"][0] == "<U6")
     for old, new, message in (
         (json.dumps(labels), json.dumps([labels[0], [0], *labels[2:]]), r"label: expected 1 rows, got 0"),
+        (json.dumps(labels), json.dumps([labels[0], [0] * 53, *labels[2:]]), "expected an array of numbers"),
         ("0.1", "NaN", "unknown node nan"),
         ("0.1", "1e999", "unknown node inf"),
     ):
