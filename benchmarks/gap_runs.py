@@ -320,7 +320,7 @@ class GapBenchSettings:
     """Passes over each recording with made gaps, the lives compared, lengths of made gaps, s.
 
     real  whether the gaps of the recordings themselves are judged too, and the links
-    of    situations, one of which objects are in at the end of made gaps (`benchmarks.gap_runs`); none: any
+    of    situations, one of which objects are in at the end of made gaps; none: any
     """
 
     passes: int = 2

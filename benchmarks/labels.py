@@ -7,7 +7,7 @@ together    both methods' tracks refined to one result
 detections  labels from the detections that all of them had, by `saga-fg smooth`; tracked: by `saga-fg track`
 headings    of these labels: the share that is turned round, of boxes that match a true object, all and handed out
 doubt       of these labels: how often what they say with a probability is so
-corrected   by an annotator who knows the truth and looks at a tenth of their tracks (`benchmarks.labels`)
+corrected   by an annotator who knows the truth and looks at a tenth of their tracks
 
 Errors of labels against the truth, and an annotator who knows the truth and corrects the tracks looked at.
 

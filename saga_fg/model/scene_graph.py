@@ -62,7 +62,7 @@ class OwnMotions(NamedTuple):
 
 
 class RecordedMotions(Protocol):
-    """Known courses (`saga_fg.model.manoeuvres`) or mixtures of motion (`saga_fg.model.manoeuvres`) of some nodes."""
+    """Known courses or mixtures of motion of some nodes (`saga_fg.model.manoeuvres`)."""
 
     @property
     def ids(self) -> IntArray: ...

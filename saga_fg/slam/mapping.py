@@ -1,10 +1,7 @@
 """Maps of landmarks of unknown identity, estimated jointly with the poses.
 
-Poses and landmarks in a running graph: their keys, and providers of motions and of associated observations.
-
-The pose and the landmarks near it as one Gaussian, and observations of these linearised.
-
-The pose and the landmarks near it as one Gaussian, kept by an error-state Kalman filter between two smoothings.
+In a running graph, poses and landmarks have keys, and providers add motions and associated observations. Between two
+smoothings the pose and the landmarks near it are one Gaussian, kept by an error-state Kalman filter (`LocalMap`).
 
 What is observed from near the pose says of landmarks farther off only what it says of these, so that a filter of these
 alone is the filter of the whole map, marginalised. State x = (pose, l_1, ..., l_n) with covariance P of its tangents.

@@ -7,7 +7,7 @@ interval and recorded with it (`saga_fg.model.manoeuvres`).
 
 For an interval the edges of the scene graph are those of its start:
 
-x(t + dt) = F x(t) + b + w,   w ~ N(0, Q)   with F, b and Q of the graph's edges (`saga_fg.model.discretisation`)
+    x(t + dt) = F x(t) + b + w,   w ~ N(0, Q)     with F, b and Q of the edges (`saga_fg.model.discretisation`)
 
 Look ahead: the tracks that are reported now at future times, predicted jointly, with edges that go on to act.
 

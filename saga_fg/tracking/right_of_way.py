@@ -6,7 +6,7 @@ unless one is behind the other there or they pass head on. A vehicle waits at th
 before that point (`saga_fg.tracking.edge_record`), else `CROSSING` or `JOINING` m before it, and has arrived
 `ARRIVES` m before this line.
 
-For each ordered pair i, j the evidence e (`evidence`) holds distances, speeds, times, who leads, where traffic halts
+For each ordered pair i, j the evidence e (`_evidence`) holds distances, speeds, times, who leads, where traffic halts
 and the order of arrival. The probability that i yields to j is
 
     p = 1 / ( 1 + exp(-z) ),   z = w tanh(V [e, 1]) + w_0

@@ -1,8 +1,8 @@
 """The graph-aware tracker: one frame of one sensor at a time, from any sensor at any time.
 
-    predict (prediction, courses) -> measure (measurements, map_nodes, visibility) -> associate (association, relinking)
-    -> follow encounters (update, encounters) -> update, existence (update, unresolved) -> hand over (relinking)
-    -> initiate (initiation) -> exchange identities (update) -> delete, report (reporting)
+    predict (prediction) -> measure (measurements, map_nodes, update) -> associate (association, relinking)
+    -> follow encounters (update, identities) -> update (update; edges: prediction) -> existence (update, track_life)
+    -> hand over (relinking) -> initiate (track_life) -> exchange identities (update) -> delete, report (track_life)
 
 (figure 2 of Sani and Anand, arXiv 2411.03702), in brackets the modules of each stage. Without edge rules this is the
 classical tracker of independent Kalman filters, by the same code.

@@ -1,8 +1,4 @@
-"""Input of the joint estimation, and the stationarity of objects in it.
-
-Input of the joint estimation: settings, odometry, and a record of both sensors epoch by epoch.
-
-Record of the joint estimator's input, epoch by epoch: odometry, objects, and the detections assigned to them.
+"""Input of the joint estimation, epoch by epoch: odometry, objects with their detections, and which are stationary.
 
 A tracker associates the detections: along a path, given or estimated so far, it steps through the frames; its
 assignment and its graph of interactions are recorded (`Tracker.assignment`, `Tracker.graph`). Detections are kept in

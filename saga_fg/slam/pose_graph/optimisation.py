@@ -1,7 +1,5 @@
 """The minimum of a pose graph, from several starts, and without false loops.
 
-The minimum of a pose graph, from several starts.
-
 Pose graphs have many local minima, and the start decides which one a solver finds. Dead reckoning may lie in the basin
 of a bad one; the chordal start (`chordal_poses`) uses every measurement and no guess, in closed form. Both are tried,
 and the lower error is kept. Where the minimum of the chordal cost is to be certified
@@ -9,11 +7,10 @@ and the lower error is kept. Where the minimum of the chordal cost is to be cert
 only where their own error is lower than what it led to: from far off, solvers take long to find bad minima. The first
 pose is fixed, unless priors say where poses are.
 
-Selection of the true loop closures of a pose graph.
-
-Odometry (between successive poses), priors, known places and landmarks are trusted. First, graduated non-convexity
-with truncated least squares from dead reckoning, c^2 the 99 % quantile of chi^2: in each step of mu one weighted
-Gauss-Newton step. s is the distance of a loop in standard deviations, and the weights of the surrogate are
+The true loop closures are chosen in two steps (`consensus`). Odometry (between successive poses), priors, known places
+and landmarks are trusted. First, graduated non-convexity with truncated least squares from dead reckoning, c^2 the 99 %
+quantile of chi^2: in each step of mu one weighted Gauss-Newton step. s is the distance of a loop in standard
+deviations, and the weights of the surrogate are
 
     w = 1                             s^2 <= mu/(mu+1) c^2
         0                             s^2 >= (mu+1)/mu c^2       mu from c^2 / (2 s_max^2 - c^2) up, by 1.4,

@@ -5,7 +5,7 @@
     loops                                              factors between anchors, under a robust loss
 
 A submap is anchored at its first keyframe. When it is long enough, the keyframe at hand becomes the anchor of the next
-one, and everything in between is eliminated (`condensing`). Landmarks belong to one submap: what is seen on is a
+one, and everything in between is eliminated (`CondensedSubmap`). Landmarks belong to one submap: what is seen on is a
 landmark of the next again, and they are tied through the poses.
 
 So the running graph has the submap at hand and the anchors of all others, and a keyframe costs nearly as much at the
