@@ -1,7 +1,5 @@
 """Journals of tracking, read back and explained track by track, and the clocks of sensors in words.
 
-Journals of tracking: written by the tracker, read back and explained track by track.
-
 A journal lies beside the result it belongs to, `RESULT.journal.jsonl`, an event (`saga_fg.tracking.journal`) a line.
 """
 

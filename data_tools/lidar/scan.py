@@ -1,6 +1,4 @@
-"""Sweeps of a LiDAR, and recordings of them.
-
-Sweeps of a LiDAR: de-skewed, thinned to voxels, without points on moving objects.
+"""Sweeps of a LiDAR, de-skewed, thinned to voxels, without points on moving objects, and recordings of them.
 
 Motion de-skew: points of a sweep transformed to one time.
 
@@ -309,7 +307,7 @@ class RecordingOptions:
 
 @dataclass(frozen=True, eq=False)
 class ScanRecording:
-    """K scans in order of time, read on access: `data_tools.lidar.scan.ScanSequence`.
+    """K scans in order of time, read on access, a `ScanSequence`.
 
     layout       its name
     timestamps   (K,) s

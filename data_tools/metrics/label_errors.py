@@ -19,10 +19,8 @@ The velocity of a label is the difference of its positions `reach` frames before
 
 and unknown where the object has no label at either. A label is *moving* if its speed is at least `MOVING`, else parked.
 
-Summary of the errors at labels: root mean squares, and the consistency of the covariances.
-
-The shares of errors within the tracks' ellipses (`data_tools.metrics.label_errors`) are meaningful for classes with
-enough objects and boxes.
+A summary has root mean squares of the errors at labels, and the consistency of the covariances. The shares of errors
+within the tracks' ellipses are meaningful for classes with enough objects and boxes.
 """
 
 from __future__ import annotations

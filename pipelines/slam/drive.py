@@ -1,8 +1,7 @@
 """A drive: poses of all scans by odometry, and its submaps, which are the map.
 
-A drive as odometry leaves it: poses of all scans, and motions between them with their covariances.
-
-Submaps from keyframes: points are collected while a submap runs, and thinned to one cloud when it is closed.
+Odometry leaves poses of all scans, and motions between them with their covariances. Points of keyframes are collected
+while a submap runs, and thinned to one cloud when it is closed.
 
 The map of a drive as a folder: the points of each submap in a file, and where each lies.
 

@@ -1,7 +1,5 @@
 """Loop closures: submaps that look alike from above, proved by registration and by agreement.
 
-Loop closures by place: submaps that look alike from above, proved by registration.
-
 1. Recognition (`data_tools.lidar.places`): the images of older submaps that are most like the new one are aligned with
    it, without a guess. Submaps further off than any drift are left out.
 2. Proof: the best are registered, and what stands above the ground must lie on each other, in both directions, where

@@ -1,6 +1,4 @@
-"""Hidden objects of recordings, predicted while the tracks around them go on.
-
-Objects of recordings that are hidden for some seconds while the tracks around them go on, predicted by the tracker.
+"""Objects of recordings that are hidden for some seconds, predicted while the tracks around them go on.
 
 A tracker without edges goes through a recording. Each of its tracks that holds a labelled object begins a gap at many
 moments: from there on its object is hidden, and the track is predicted by the tracker's own step

@@ -1,7 +1,5 @@
 """Argoverse 2 sensor logs with annotations, detections and vector maps in; `Scene`s out.
 
-Argoverse 2 sensor logs: annotations and poses, in; `Scene`s with ground truth alone, out.
-
 A log without annotations, as of the test split, has no moments of its own.
 
     LOG/annotations.feather            timestamp_ns, track_uuid, category, length_m, width_m, height_m,

@@ -1,6 +1,4 @@
-"""The KITTI tracking dataset: poses, calibration, labels, detections, scans and images.
-
-The KITTI tracking dataset: official poses, calibration and labels, and detections as text, in; `Scene`s out.
+"""The KITTI tracking dataset: poses, calibration, labels, detections, scans and images in; `Scene`s out.
 
 A sequence has a moment for every record of its GPS/IMU (10 Hz; times count from 0). World coordinates are east, north,
 up from the place of the first record; the ego frame is the IMU's (x ahead, y left, z up). Every moment has a frame of

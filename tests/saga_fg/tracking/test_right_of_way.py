@@ -151,7 +151,7 @@ def test_probabilities_are_finite_for_extreme_evidence():
 
 
 def frames(count=12, **more):
-    """Four vehicles pass from the west, then two meet; a third one is parked beside the road all the time."""
+    """Two vehicles come to a crossing, from the west and the south; a third one is parked beside the road."""
     for k in range(count):
         position = [[-20 + 0.8 * k, 0, 0.8], [0, -20 + 0.6 * k, 0.8], [-6, -4.5, 0.8]]
         size, velocity = [[4.5, 1.8, 1.6]] * 3, [[np.nan, np.nan]] * 3
