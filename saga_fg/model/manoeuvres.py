@@ -155,7 +155,6 @@ def _rotated(v: FloatArray, c: FloatArray, s: FloatArray) -> FloatArray:
 RATE_CORRELATION = 1.0  # s
 _MIN_TIME = 1e-3  # s, so that a fading time of 0 divides nothing by 0: the rate is gone at once
 _MIN_RATE = 1e-9  # 1/s, so that nothing is divided by 0
-_P, _V, _A = slice(0, 2), slice(2, 4), slice(4, 6)
 
 
 class Unseen(NamedTuple):
