@@ -45,6 +45,8 @@ def evaluate_labels(
     online, labels = [], []
     for name in np.unique(rows.scene).tolist():
         scene = dataset.scene(name)
+        if scene.ground_truth is None:
+            raise InputError(f"scene {name}: expected ground truth, there is none")
         tracked = track_scene(scene, config.tracking.new_tracker(method), progress)
         online.append((scene, SceneBoxes.of_tracks(tracked.tracks)))
         labels.append((scene, scene_result(scene, rows, table).found))

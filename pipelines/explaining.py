@@ -143,7 +143,17 @@ def read_events(journal: Path) -> Iterator[Event]:
             event = parsed_json(line, f"{journal}: line {number}")
             if not isinstance(event, dict):
                 raise InputError(f"{journal}: line {number}: expected an event, got {str(event)[:40]}")
+            if event.get("event") == "yields" and not _tells_yields(event):
+                raise InputError(f"{journal}: line {number}: expected a time, and yields [[source, target, p], ...]")
             yield event
+
+
+def _tells_yields(event: Event) -> bool:
+    rows = event.get("yields")
+    if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != 3 for row in rows):
+        return False
+    numbers = [event.get("time"), *(value for row in rows for value in row)]
+    return all(isinstance(value, int | float) and math.isfinite(value) for value in numbers)
 
 
 def story(events: Sequence[Event]) -> list[str]:

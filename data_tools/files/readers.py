@@ -28,6 +28,7 @@ from saga_fg.numerics import FloatArray
 
 LONGEST = 100  # characters of a value
 LARGEST = 1e15  # largest number; its square does not overflow
+_EXACT = 2.0**53  # floats below it tell whole numbers apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,14 +79,20 @@ class TextTable:
     def integers(
         self, column: int, name: str, smallest: int, largest: int = 2**31
     ) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-        """A column as whole numbers (N,), exact up to 2^53. Raises `InputError` naming the line of one out of range."""
-        numbers = self.numbers([column], (name,), np.inf)[:, 0]
-        bad = (numbers != np.rint(numbers)) | (numbers < smallest) | (numbers > largest)
+        """A column as whole numbers (N,). Raises `InputError` naming the line of one out of range."""
+        text = self.values[:, column]
+        try:
+            numbers = text.astype(np.int64)  # exact, where floats are not from 2^53 on
+            bad = (numbers < smallest) | (numbers > largest)
+        except (ValueError, OverflowError):
+            self.numbers([column], (name,), np.inf)
+            whole = [_whole(value) for value in text.tolist()]
+            bad = np.array([value is None or not smallest <= value <= largest for value in whole])
+            numbers = np.array([0 if wrong else value for value, wrong in zip(whole, bad, strict=True)], dtype=np.int64)
         if bad.any():
             row = int(np.argmax(bad))
-            got = self.values[row, column][:40]
-            raise self.fault(row, f"{name}: expected a whole number from {smallest} to {largest}, got {got}")
-        return numbers.astype(np.int64)
+            raise self.fault(row, f"{name}: expected a whole number from {smallest} to {largest}, got {text[row][:40]}")
+        return numbers
 
     def fault(self, row: int, what: str) -> InputError:
         """An error about one row."""
@@ -124,6 +131,15 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         return np.nan
+
+
+def _whole(text: str) -> int | None:
+    """The whole number that a text says exactly, if it does: 12, 12.0 and 1.2e1, but not 7e18."""
+    try:
+        return int(text)
+    except ValueError:
+        number = float(text)
+        return int(number) if number.is_integer() and abs(number) < _EXACT else None
 
 
 _SPACE = " \t\n\r"

@@ -115,8 +115,11 @@ def assert_equal_in_every_step(
 
 
 def check_methods(make: Make) -> None:
-    """All methods of the protocol are there."""
-    estimator = make()
+    """It can be made, and is an `Estimator` with all methods that every estimator has."""
+    try:
+        estimator = make()
+    except TypeError as error:  # of a class that lacks some
+        raise AssertionError(str(error)) from error
     require(isinstance(estimator, Estimator), f"expected an Estimator, got {type(estimator).__name__}")
 
 

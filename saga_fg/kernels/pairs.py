@@ -105,6 +105,112 @@ def gated_pairs(
     return rows[0, :k], rows[1, :k], innovation[:k], S[:k], costs[0, :k], costs[1, :k]
 
 
+@kernel("i1 i1 f2 f3 f2 f3 f1 f1 f2 f3 i1 f1 f f")
+def relinking_pairs(
+    tracks: IntArray,
+    group: IntArray,
+    position: FloatArray,
+    P: FloatArray,
+    place: FloatArray,
+    D: FloatArray,
+    stationary: FloatArray,
+    log_survival: FloatArray,
+    z: FloatArray,
+    R: FloatArray,
+    group_z: IntArray,
+    log_density: FloatArray,
+    least: float,
+    rounding: float,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Pairs of `tracks` and measurements (k,) with their costs (k,) < 0, the least log-odds less theirs.
+
+    Of all n tracks: group (n,), N(position, P) if they move, N(place, D) if they are stationary, with the probability
+    `stationary` (n,); of m measurements: z (m, 2), R (m, 2, 2), group_z (m,), log_density (m,) of others like them.
+    Left out are pairs whose distance neither density reaches, see `saga_fg.tracking.relinking`; rounding: factor on it
+    """
+    largest = -math.inf
+    for j in range(len(z)):
+        largest = max(largest, -log_density[j])
+    found_t, found_d, costs = [0][:0], [0][:0], [0.0][:0]
+    gates = np.empty(2)
+    log_2_pi = math.log(2 * math.pi)
+    for i in tracks:
+        most = log_survival[i] + largest - log_2_pi - least
+        for still in range(2):
+            C = D if still else P
+            det = max(C[i, 0, 0] * C[i, 1, 1] - C[i, 0, 1] * C[i, 0, 1], 1e-300)
+            gates[still] = max(2 * most - math.log(det), 0.0) * rounding
+        for j in range(len(z)):
+            if group[i] != group_z[j]:
+                continue
+            near = False
+            for still in range(2):
+                mean, C = (place, D) if still else (position, P)
+                x, y = z[j, 0] - mean[i, 0], z[j, 1] - mean[i, 1]
+                trace = C[i, 0, 0] + C[i, 1, 1] + R[j, 0, 0] + R[j, 1, 1]
+                near = near or x * x + y * y <= gates[still] * trace
+            if not near:
+                continue
+            s = min(max(stationary[i], 0.0), 1 - 1e-9)
+            terms = math.log1p(-s), math.log(max(s, 1e-300))
+            total = -math.inf
+            for still in range(2):
+                mean, C = (place, D) if still else (position, P)
+                x, y = z[j, 0] - mean[i, 0], z[j, 1] - mean[i, 1]
+                a, b, c = C[i, 0, 0] + R[j, 0, 0], C[i, 0, 1] + R[j, 0, 1], C[i, 1, 1] + R[j, 1, 1]
+                det = a * c - b * b
+                density = -0.5 * ((c * x * x - 2 * b * x * y + a * y * y) / det + np.log(det)) - log_2_pi
+                term = density + (terms[1] if still else terms[0])
+                high, low = max(total, term), min(total, term)
+                total = high if low == -math.inf else high + math.log1p(math.exp(low - high))
+            cost = least - (log_survival[i] + total - log_density[j])
+            if cost < 0:
+                found_t.append(i)
+                found_d.append(j)
+                costs.append(cost)
+    return np.array(found_t), np.array(found_d), np.array(costs)
+
+
+@kernel("i1 i1 i1 f1 f1 f2 f3 f2 f3 f")
+def returned_pairs(
+    new: IntArray,
+    old: IntArray,
+    group: IntArray,
+    initiated: FloatArray,
+    last_detected: FloatArray,
+    position: FloatArray,
+    P: FloatArray,
+    place: FloatArray,
+    D: FloatArray,
+    farthest: float,
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Rows of pairs of `new` and `old` tracks (e,), and the number (e,) of new ones of the group.
+
+    They share a group, the old one was last detected before the new one's start, and the squared distance of their
+    positions, N(position, P), or of their stationary places, N(place, D), is below `farthest`.
+    """
+    first, second, others = [0][:0], [0][:0], [0][:0]
+    for i in new:
+        alike = 0
+        for j in new:
+            alike += group[j] == group[i]
+        for j in old:
+            if group[j] != group[i] or not last_detected[j] < initiated[i]:
+                continue
+            for still in range(2):
+                mean, covariance = (place, D) if still else (position, P)
+                x, y = mean[i, 0] - mean[j, 0], mean[i, 1] - mean[j, 1]
+                a = covariance[i, 0, 0] + covariance[j, 0, 0]
+                b = covariance[i, 0, 1] + covariance[j, 0, 1]
+                c = covariance[i, 1, 1] + covariance[j, 1, 1]
+                if (c * x * x - 2 * b * x * y + a * y * y) / (a * c - b * b) < farthest:
+                    first.append(i)
+                    second.append(j)
+                    others.append(alike)
+                    break
+    return np.array(first), np.array(second), np.array(others)
+
+
 @kernel("f2 f3 f2 f3 b1 f3 f1 f1 f1 f2 f3")
 def return_evidence(
     mean: FloatArray,

@@ -218,7 +218,8 @@ def path_meetings(points: FloatArray, reach: IntArray, near: float, spacing: flo
     point of the first path, and the point of the second one that is nearest to it.
     """
     k = len(points)
-    pair, place, found = np.empty((k * k, 2), dtype=np.int64), np.empty((k * k, 2), dtype=np.int64), 0
+    most = k * (k - 1) // 2
+    pair, place, found = np.empty((most, 2), dtype=np.int64), np.empty((most, 2), dtype=np.int64), 0
     for p in range(k):
         for q in range(p + 1, k):
             a, least = 0, math.inf

@@ -42,7 +42,6 @@ __all__ = [
 
 _LOG = logging.getLogger(__name__)
 _LONGEST = 0.5  # s that the first measurement stands for at most; the second one says how long its interval is
-_HISTORY = 3  # measurements that were taken and are kept, whose intervals say what comes next
 _GAP = 3.0  # intervals like the one before, beyond which measurements are missing
 _NOTHING = 1e-9  # s
 
@@ -51,24 +50,23 @@ class SensorBuffer:
     """Measurements that no pose has taken yet. Every method raises `InputError` for time that runs backwards."""
 
     def __init__(self) -> None:
-        self._kept: dict[str, list[tuple[float, FloatArray]]] = {"imu": [], "wheels": []}
+        self._kept: dict[str, list[tuple[float, float, FloatArray]]] = {"imu": [], "wheels": []}
         self._gps = list[tuple[float, GpsFix]]()
         self._newest: dict[str, float] = {}
         self._taken = -math.inf
         self._silent: set[str] = set()
+        self._regular: set[str] = set()  # sensors with two measurements at least
 
     def add_imu(self, time: float, acceleration: FloatArray, angular_rate: FloatArray) -> None:
         """Specific force (3,), m/s^2, and turn rate (3,), rad/s, at `time`, s, for the time since the sample before."""
         both = [checked("imu: acceleration", acceleration, (3,)), checked("imu: angular_rate", angular_rate, (3,))]
-        self._in_order("imu", time)
-        self._kept["imu"].append((time, np.concatenate(both)))
+        self._add("imu", time, np.concatenate(both))
 
     def add_wheels(self, time: float, speed: float) -> None:
         """Speed ahead, m/s, at `time`, s, for the time since the speed before."""
         if not math.isfinite(speed):
             raise InputError(f"wheels: speed: expected a finite number, got {speed!r}")
-        self._in_order("wheels", time)
-        self._kept["wheels"].append((time, np.array([speed])))
+        self._add("wheels", time, np.array([speed]))
 
     def add_gps(self, time: float, position: FloatArray, covariance: FloatArray | None = None) -> None:
         """A place (2,) or (3,), world, m, at `time`, s; covariance, m^2: by the settings if None."""
@@ -97,11 +95,8 @@ class SensorBuffer:
         """
         if not (kept := self._kept[sensor]):
             return np.empty(0), np.empty((0, 0))
-        time, value = (np.array(column) for column in zip(*kept, strict=True))
-        self._kept[sensor] = kept[max(int(np.searchsorted(time, until, side="right")) - _HISTORY, 0) :]
-        length = np.diff(time, prepend=-math.inf)
-        length[:2] = length[1:2].min(initial=_LONGEST)
-        length[1:] = np.where(length[1:] > _GAP * length[:-1], length[:-1], length[1:])
+        time, length, value = (np.array(column) for column in zip(*kept, strict=True))
+        self._kept[sensor] = kept[max(int(np.searchsorted(time, until, side="right")) - 1, 0) :]
         start, end = time - length, time.copy()
         if since < time[-1] <= until:
             end[-1] += min(until - end[-1], length[-1])
@@ -113,6 +108,21 @@ class SensorBuffer:
         (self._silent.add if silent else self._silent.discard)(sensor)
         used = (spans > _NOTHING) & math.isfinite(since)
         return spans[used], value[used]
+
+    def _add(self, sensor: str, time: float, value: FloatArray) -> None:
+        """Keep a measurement and the time that it stands for, s; of the first, that is known from the second on."""
+        self._in_order(sensor, time)
+        kept, length = self._kept[sensor], _LONGEST
+        if kept:
+            before, usual, other = kept[-1]
+            length = time - before
+            if sensor not in self._regular:
+                self._regular.add(sensor)
+                length = min(length, _LONGEST)
+                kept[-1] = before, length, other
+            elif length > _GAP * usual:
+                length = usual
+        kept.append((time, length, value))
 
     def _in_order(self, sensor: str, time: float) -> None:
         newest = self._newest.get(sensor, -math.inf)

@@ -14,6 +14,7 @@ from saga_fg.estimators import Estimator, GraphFilter, JointKalmanFilter
 from saga_fg.graph import FactorProvider
 from saga_fg.parts import find, made, part_kind, require_name
 
+POSES = ("extend", "covariance_with")  # methods that an estimated pose of the vehicle needs
 GROUP = "saga_fg.estimators"
 
 
@@ -70,7 +71,7 @@ def new_estimator(
     estimator = made(where, made_by, **{one.name: values[one.name] for one in parameters if one.name in values})
     if not isinstance(estimator, Estimator):
         raise InputError(f"{where}: expected a class derived from saga_fg.estimators.Estimator, got {estimator!r:.60}")
-    if poses and type(estimator).extend is Estimator.extend:
+    if poses and any(getattr(type(estimator), name) is getattr(Estimator, name) for name in POSES):
         raise InputError(f"ego.estimated: expected the estimator isam2 or fixed-lag, got {estimator_name(given)}")
     return estimator
 

@@ -46,7 +46,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from saga_fg.kernels.pairs import return_evidence
+from saga_fg.kernels.pairs import relinking_pairs, return_evidence, returned_pairs
 from saga_fg.model import POSITION, VELOCITY
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, Matching, StrArray, least_total, mahalanobis_of_pairs
 from saga_fg.tracking.measurements import FrameMeasurements
@@ -55,6 +55,7 @@ from saga_fg.tracking.tracker_state import LIFETIME, TrackerState
 
 CONFIRMING = 3  # detections that confirm a track of one sensor, and up to which it may be an earlier one; usual 2 to 5
 NOMINAL_AREA = 5000.0  # m^2, where `clutter_area` is infinite: a disc of 40 m, in which most objects are detected
+_ROUNDING = 1 + 1e-6
 _FARTHEST = 100.0  # squared distance of two positions from which not even the narrowest densities join tracks
 
 
@@ -105,15 +106,23 @@ def _pairs(
     that re-linking pays for."""
     still = state.table.stationarity
     group, of_place = state.confused.numbers(state.table.label, label)
-    row, j = (group[tracks, None] == of_place).nonzero()
-    t, log_others = tracks[row], np.log(np.bincount(of_place)[of_place] / area(state))
-    moving, resting = (
-        log_density(z[j] - mean[t], C[t] + R[j]) for mean, C in ((position, P), (still.position, still.P))
+    log_others = np.log(np.bincount(of_place)[of_place] / area(state))
+    return relinking_pairs(
+        tracks=tracks,
+        group=group,
+        position=position,
+        P=P,
+        place=still.position,
+        D=still.P,
+        stationary=still.probability,
+        log_survival=log_survival(state),
+        z=z,
+        R=R,
+        group_z=of_place,
+        log_density=log_others,
+        least=min_log_odds(state),
+        rounding=_ROUNDING,
     )
-    log_density_of_track = log_survival(state)[t] + _log_mixture(still.probability[t], moving, resting)
-    cost = min_log_odds(state) - (log_density_of_track - log_others[j])
-    paying = cost < 0
-    return t[paying], j[paying], cost[paying]
 
 
 def _log_mixture(stationary: FloatArray, moving: FloatArray, resting: FloatArray) -> FloatArray:
@@ -204,15 +213,18 @@ def _possible_returns(state: TrackerState, matching: Matching) -> tuple[IntArray
     old = (~detected & resolved & (table.coasting(state.time) <= settings.max_coasting)).nonzero()[0]
     now, still = state.kinematics(), table.stationarity
     (group,) = state.confused.numbers(table.label)
-    before = table.last_detected[old] < table.initiated[new, None]
-    row, column = (before & (group[new, None] == group[old])).nonzero()
-    a, b, others = new[row], old[column], (group[new, None] == group[new]).sum(axis=1)[row]
-    apart = [
-        mahalanobis_of_pairs(mean[a] - mean[b], C[a] + C[b])[0]
-        for mean, C in ((now.position, now.P), (still.position, still.P))
-    ]
-    near = np.minimum(*apart) < _FARTHEST
-    return a[near], b[near], others[near]
+    return returned_pairs(
+        new=new,
+        old=old,
+        group=group,
+        initiated=table.initiated,
+        last_detected=table.last_detected,
+        position=now.position,
+        P=now.P,
+        place=still.position,
+        D=still.P,
+        farthest=_FARTHEST,
+    )
 
 
 def _log_evidence(state: TrackerState, new: IntArray, old: IntArray) -> tuple[FloatArray, FloatArray]:

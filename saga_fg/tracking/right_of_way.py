@@ -163,6 +163,7 @@ def _meetings(
     course = np.repeat(paths.heading[:, 1:], len(step), axis=1)
     course = np.concatenate([np.repeat(heading[:, None], BEHIND, axis=1), course], axis=1)
     reach = (np.minimum(LOOKS + AHEAD * speed, FARTHEST) / SPACING).astype(np.int64) + BEHIND
+    reach = np.minimum(reach, points.shape[1])
     pair, at = path_meetings(points, reach, NEAR, SPACING)
     way, angle = SPACING * (at - BEHIND), course[pair, at]
     cosine = np.cos(angle[:, 0] - angle[:, 1])

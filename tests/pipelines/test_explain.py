@@ -69,7 +69,12 @@ def test_tracks_and_graphs_that_are_not_there(folder, tmp_path, monkeypatch):
 
 def test_journals_that_are_not_there_or_broken(tmp_path):
     assert "track with --explain" in refused("explain", tmp_path / "tracks.json", "--track", "1")
-    for content, expected in (("{\n", "line 1: broken or truncated JSON"), ("3\n", "line 1: expected an event")):
+    for content, expected in (
+        ("{\n", "line 1: broken or truncated JSON"),
+        ("3\n", "line 1: expected an event"),
+        ('{"event": "yields"}\n', "line 1: expected a time, and yields"),
+        ('{"event": "yields", "time": 1.0, "yields": [[1, 2]]}\n', "line 1: expected a time, and yields"),
+    ):
         (tmp_path / "tracks.json.journal.jsonl").write_text(content)
         assert expected in refused("explain", tmp_path / "tracks.json", "--track", "1")
 

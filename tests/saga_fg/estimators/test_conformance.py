@@ -284,6 +284,25 @@ def test_what_a_node_told_of_its_neighbours_stays_when_it_leaves(make):
     assert np.linalg.norm(told.mean([2]) - untold.mean([2])) > 0.01
 
 
+def test_the_suite_would_notice():
+    """The comparison itself: an estimator that forgets a correlation, or is off by a thousandth of a sigma, fails."""
+
+    class Forgetful(JointKalmanFilter):
+        def joint_covariance(self, nodes):
+            P = super().joint_covariance(nodes)
+            return np.where(np.abs(P) < np.abs(P).max() * 1e-2, 0.0, P)
+
+    class Sloppy(JointKalmanFilter):
+        def joint_mean(self, nodes):
+            mean = super().joint_mean(nodes)
+            return mean + 1e-3
+
+    program = random_program(np.random.default_rng(2), moments=5)
+    for kind in (Forgetful, Sloppy):
+        with pytest.raises(AssertionError):
+            in_step(program, kind())
+
+
 # Every estimator is indifferent to order, to coupling where there is none, and to a snapshot between
 
 

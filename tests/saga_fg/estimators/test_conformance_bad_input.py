@@ -1,6 +1,9 @@
 """Bad input to every estimator: one clear exception, and nothing has happened."""
 
 import dataclasses
+import subprocess
+import sys
+import textwrap
 
 import numpy as np
 import pytest
@@ -137,6 +140,44 @@ def test_bad_input_ends_in_one_exception_and_changes_nothing(make, subtests):
                 estimator.joint_covariance([4, 15, 16, 23]), untouched.joint_covariance([4, 15, 16, 23])
             )
             assert np.array_equal(estimator.joint_mean([4, 15, 16, 23]), untouched.joint_mean([4, 15, 16, 23]))
+
+
+def test_bad_input_does_not_end_the_interpreter():
+    """All of it to all estimators, in an interpreter of its own: a crash in compiled code could not be caught here."""
+    script = textwrap.dedent(
+        f"""
+        import sys, warnings
+        sys.path[:0] = {sys.path!r}
+        warnings.simplefilter("error")
+        from tests.saga_fg.estimators import test_conformance_bad_input as suite
+        from saga_fg import SagaError
+        for kind in suite.ESTIMATORS:
+            estimator = suite.filled(suite.maker(kind.values[0]))
+            for name, (call, message) in suite.BAD.items():
+                try:
+                    call(estimator)
+                except SagaError:
+                    continue
+                sys.exit(f"{{kind.id}}: {{name}}: no exception")
+            estimator.update(suite.measured([4, 16]))
+            estimator.predict(suite.transition(suite.IDS, dt=1000.0))
+            print(kind.id, len(estimator.nodes))
+        """
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr[-2000:] + done.stdout[-2000:]
+    assert done.stdout.split() == [word for kind in ESTIMATORS for word in (kind.id, "4")]
+
+
+def test_of_no_nodes_there_is_nothing_to_tell(make):
+    for estimator in (make(), filled(make)):
+        nodes = estimator.nodes.tolist()
+        assert estimator.mean([]).shape[0] == estimator.covariance([]).shape[0] == 0
+        assert estimator.joint_mean([]).shape == (0,)
+        assert estimator.joint_covariance([]).shape == (0, 0)
+        assert estimator.update(Measurements([], [], [], [])) == 0.0
+        estimator.marginalise([])
+        assert estimator.nodes.tolist() == nodes
 
 
 def test_a_snapshot_of_another_kind_of_estimator_is_refused(make, subtests):

@@ -216,6 +216,17 @@ def test_a_gap_after_the_first_sample_is_not_filled():
     assert buffer.take(1.4).wheels.dt == pytest.approx(0.1 + 0.5 + 0.1)
 
 
+def test_two_silences_in_a_row_are_not_filled():
+    buffer = SensorBuffer()
+    buffer.take(0.0)
+    for time in (0.01, 0.02, 0.03):
+        buffer.add_imu(time, np.zeros(3), np.zeros(3))
+    buffer.take(0.03)
+    for time in (5.03, 10.03, 10.04):
+        buffer.add_imu(time, np.zeros(3), np.zeros(3))
+    np.testing.assert_allclose(buffer.take(10.04).imu.dt, [0.01, 0.01, 0.01])
+
+
 def test_a_buffer_gives_each_pose_what_came_since_the_one_before():
     buffer = SensorBuffer()
     buffer.take(0.0)
