@@ -133,8 +133,7 @@ def test_a_name_belongs_to_one_package(packages):
 
 def test_help_lists_what_can_be_evaluated_and_those_that_come_along_are_sources():
     listed = re.findall(r"^  (\w+) ", saga_fg("evaluate", "--help").stdout, re.M)
-    assert {"nuscenes", "file", "simulated", "labels"} <= set(listed)
-    assert "mcap" not in listed
+    assert {"nuscenes", "file", "mcap", "simulated", "labels"} <= set(listed)
     for name in source.BUILT_IN:
         found = source.dataset_source(name)
         assert issubclass(found, DatasetSource)
@@ -148,7 +147,7 @@ def test_help_lists_what_can_be_evaluated_and_those_that_come_along_are_sources(
         (("track", "nothing"), "error: unknown dataset 'nothing'"),
         (
             ("evaluate", "mcap", "tracks.csv"),
-            "error: evaluate mcap: expected ground truth, there is none; score a table: saga-fg evaluate file",
+            "error: evaluate mcap: expected ground truth, there is none; name it: --truth TABLE",
         ),
         (("track", "own.csv"), "error: own.csv: expected a dataset before the file: saga-fg track file own.csv ..."),
         (("view", "a bag"), "error: a bag: expected a dataset before the file: saga-fg view mcap 'a bag' ..."),

@@ -158,8 +158,8 @@ def points_on(result: SlamResult, places: np.ndarray, size: np.ndarray = SIZE) -
 def test_the_trail_of_a_moving_car_is_not_in_the_map():
     scans, frames, places = drive_behind_a_car()
     settings = LidarSlamSettings(loop_closures=False, landmarks=False)
-    before = lidar_slam(scans, "lidar", settings=settings)
-    after = lidar_slam(scans, "lidar", settings=settings, objects=(frames, path_tracker(load_config("kitti"))))
+    before = lidar_slam(scans, settings=settings)
+    after = lidar_slam(scans, settings=settings, objects=(frames, path_tracker(load_config("kitti"))))
     assert points_on(before, places[5:]) > 200
     assert points_on(after, places[5:]) < 0.05 * points_on(before, places[5:])
     parked = scans.world.boxes.select(scans.world.boxes.label == "car").position

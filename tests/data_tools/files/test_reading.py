@@ -217,7 +217,8 @@ def test_what_is_whole_is_read(valid):
     assert len(read.pop("scan, LAS", "abcd")) == 4  # needs laspy
     for name in ("detections, Parquet", "detections, Feather", "image"):
         assert len(read.pop(name, "a")) == 1
-    assert json.loads(read.pop("state"))["type"] == "tracks"
+    for name in ("state", "state, graph"):
+        assert json.loads(read.pop(name))["type"] == "tracks"
     assert {name: len(content) for name, content in read.items() if isinstance(content, Sized)} == SIZES
     assert len(read["map"].points) == 1
     assert [len(scene) for scene in read["nuScenes"]] == [3, 2]

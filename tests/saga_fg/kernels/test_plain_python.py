@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from pipelines.config import load_config
 from saga_fg.kernels import compilation
 from saga_fg.kernels.compilation import Kernel
+from saga_fg.kernels.paths import path_meetings
 from tests.saga_fg.estimator_scenario import random_scenario
 from tests.saga_fg.kernels.test_kernels import played, random_frames, tracked
 
@@ -51,8 +52,17 @@ def play(seed, bounds):
         estimator.covariance([node])
 
 
+def meet():
+    rng = np.random.default_rng(0)
+    turn = np.cumsum(rng.normal(0, 0.05, (12, 40)), axis=1) + rng.uniform(-np.pi, np.pi, (12, 1))
+    points = rng.uniform(-20, 20, (12, 1, 2)) + np.cumsum(np.stack([np.cos(turn), np.sin(turn)], axis=-1), axis=1)
+    pair, _ = path_meetings(points, rng.integers(5, 41, 12), 1.5, 1.0)
+    assert 0 < len(pair) < 66
+
+
 def test_all_kernels_give_compiled_what_they_give_as_plain_python(monkeypatch):
     monkeypatch.setattr(Kernel, "__call__", both)
     track()
     play()
+    meet()
     assert {each.source.__name__ for each in compilation._kernels} - set(compared) == set()
