@@ -8,10 +8,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from data_tools.datasets.detection_files import TrackRows
-from data_tools.datasets.results import SceneResult, scene_result
+from data_tools.datasets.results import SceneResult, table_results
 from data_tools.datasets.source import DatasetSource
 from data_tools.evaluation import Evaluation, evaluate_tracks
 from data_tools.figures import write_figures
@@ -37,21 +35,22 @@ def evaluate_labels(
 
     rows   of the table of labels, whose scenes are judged; table: its file, for errors
 
-    Errors are those at the true objects that a detection matches. Raises `InputError` for an empty table, and for
-    scenes and moments that the dataset does not have, or without ground truth.
+    Errors are those at the true objects that a detection matches. Of the table, the moments nearest to the ground truth
+    count. Raises `InputError` for an empty table, and for scenes and moments that the dataset does not have, or without
+    ground truth.
     """
     if not len(rows.source):
         raise InputError(f"{table}: expected labels, there are none")
     online, labels = [], []
-    for name in np.unique(rows.scene).tolist():
-        scene = dataset.scene(name)
+    for name, found in table_results(rows, table, dataset, judged=True).items():
+        scene = found.scene
         if scene.ground_truth is None:
             raise InputError(f"scene {name}: expected ground truth, there is none")
         tracked = track_scene(scene, config.tracking.new_tracker(method), progress)
         online.append((scene, SceneBoxes.of_tracks(tracked.tracks)))
-        labels.append((scene, scene_result(scene, rows, table).found))
-    found = {"online": online, "labels": labels}
-    return {name: evaluate_tracks(each, sweep=True, detected=True) for name, each in found.items()}
+        labels.append((scene, found.found))
+    systems = {"online": online, "labels": labels}
+    return {name: evaluate_tracks(each, sweep=True, detected=True) for name, each in systems.items()}
 
 
 SHOWN = 3  # scenes in the player: a page of them all would be too large

@@ -198,7 +198,7 @@ def _warn_of_classes(results: Mapping[str, SceneResult], path: Path, how: TableI
     whose = {"tracks": tracked, "true objects": missed}
     alone = " and ".join(f"{who} of {', '.join(names)}" for who, names in whose.items() if names)
     alike = {name: each for name in missed for each in tracked if usual_class(name) == usual_class(each) is not None}
-    if len(tracked) == len(missed) == 1:
+    if len(tracked) == len(missed) == 1 and None in (usual_class(tracked[0]), usual_class(missed[0])):
         alike = {missed[0]: tracked[0]}
     hint = f"; name them alike: {how.mended(Mend(classes=alike), {}).options().strip()}" if alike else ""
     log.warning("%s: %s have no counterpart of their class, nothing of them can match%s", path, alone, hint)

@@ -16,7 +16,7 @@ from saga_fg.types import Scene
 
 _GATE = 2.0  # m, from which a pair cannot match
 _LEAST = 0.1  # recall from which AMOTA counts what matches
-_EXPLAINED = 0.5  # share of boxes that a reading matches
+_EXPLAINED, _BETTER = 0.5, 2.0  # share of boxes that a reading matches, and how many times what matches as given
 _CLEAR = 0.6  # share of the pairs with an offset that another one may have, as along a row of parked cars
 _OBJECTS, _MOMENTS = 5, 5  # objects that it matches, and moments at which one track matches an object
 _FRAMES, _LAGS, _FARTHEST = 200, 50, 1e7  # moments compared, by which times may be moved, and m of an offset
@@ -45,14 +45,17 @@ def misalignment(scenes: Sequence[tuple[Scene, SceneBoxes]]) -> str:
     truth = SceneBoxes.of_annotations((scene.ground_truth or ())[:_FRAMES], hidden=False)
     found = found.select(found.frame < _FRAMES)
     reached, *_ = near_pairs((truth.frame, truth.boxes), (found.frame, found.boxes), _GATE)
-    if len(np.unique(reached)) >= _LEAST * len(truth) or not np.isin(truth.boxes.label, found.boxes.label).any():
+    reach = len(np.unique(reached)) / max(len(truth), 1)
+    if reach >= _EXPLAINED or not np.isin(truth.boxes.label, found.boxes.label).any():
         return ""
+    given = _matched(truth, found, found.frame, found.boxes.position[:, :2])
     shares = {how: _matched(truth, found, frame, place) for how, frame, place in _readings(scene, truth, found)}
     best = max(shares.values())
-    if best < _EXPLAINED:
-        return "hardly a track is near a true object, and no other unit, turn, offset or time explains it"
+    if best < max(_EXPLAINED, _BETTER * given):
+        none = "hardly a track is near a true object; no usual unit, turn, offset or shift in time explains it"
+        return none if reach < _LEAST else ""
     how = next(how for how, share in shares.items() if share > best - 0.02)  # the plainest of those that fit alike
-    return f"hardly a track is near a true object; {how}, tracks would match {shares[how]:.0%} of the boxes"
+    return f"tracks match {given:.0%} of the boxes for long; {how}, they would match {shares[how]:.0%}"
 
 
 def _readings(scene: Scene, truth: SceneBoxes, found: SceneBoxes) -> Iterator[tuple[str, IntArray, FloatArray]]:
@@ -72,7 +75,7 @@ def _readings(scene: Scene, truth: SceneBoxes, found: SceneBoxes) -> Iterator[tu
     offset, votes = _usual_offset(apart)
     _, others = _usual_offset(apart[np.hypot(*(apart - offset).T) > 3 * _GATE])
     if others < _CLEAR * votes:
-        yield f"moved by {offset[0]:.4g}, {offset[1]:.4g} m", found.frame, place + offset
+        yield f"moved by {offset[0]:.1f}, {offset[1]:.1f} m", found.frame, place + offset
 
 
 def _usual_offset(apart: FloatArray) -> tuple[FloatArray, int]:

@@ -45,7 +45,7 @@ from typing import Self
 
 import numpy as np
 
-from data_tools.metrics.scene_boxes import Candidates, SceneBoxes, optimal_pairs
+from data_tools.metrics.scene_boxes import Candidates, SceneBoxes, optimal_pairs, track_means
 from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray
 from saga_fg.types import Boxes
 
@@ -97,7 +97,7 @@ def scored_boxes(
             kept[near] = ~_inside_any(position[near], boxes)
     rows = np.flatnonzero(kept)
     identity = _numbered(table.id[rows])
-    score = _track_means(table.score[rows], identity)
+    score = track_means(table.score[rows], identity)
     micros = np.rint(timestamps * 1e6).astype(np.int64)  # the unit of the tables, so that ratios round as they do
     return _filled(ScoredBoxes(frame[rows], identity, label[rows], position[rows, :2], score), micros)
 
@@ -119,14 +119,6 @@ def _numbered(names: np.ndarray[tuple[int], np.dtype[np.str_]]) -> IntArray:
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
     return np.asarray(rank[inverse])
-
-
-def _track_means(score: FloatArray, identity: IntArray) -> FloatArray:
-    """Mean score of each row's track. Summed track by track: thresholds compare scores to the last bit."""
-    order = np.argsort(identity, kind="stable")
-    counts = np.bincount(identity)
-    parts = np.split(score[order], np.cumsum(counts)[:-1]) if len(counts) else []
-    return np.array([np.mean(part) for part in parts], dtype=np.float64)[identity]
 
 
 def _filled(rows: ScoredBoxes, micros: IntArray) -> ScoredBoxes:

@@ -146,6 +146,11 @@ class SceneBoxes(Columns):
         bounds = np.searchsorted(self.frame, np.arange(count + 1)).tolist()
         return [self.select(slice(first, end)) for first, end in pairwise(bounds)]
 
+    @property
+    def track_score(self) -> FloatArray:
+        """(N,) mean score of the track of each box, by which evaluations rank tracks."""
+        return track_means(self.score, np.unique(self.id, return_inverse=True)[1])
+
     def annotations(self, count: int) -> list[Annotations]:
         """The boxes of each of `count` frames as objects that can be seen, to compare others with them."""
         return [Annotations(each.id, each.boxes, np.ones(len(each), dtype=np.bool_)) for each in self.by_frame(count)]
@@ -184,3 +189,11 @@ def nearest_pairs(first: FrameBoxes, second: FrameBoxes, gate: float) -> Pairs:
     labels, label = np.unique(first[1].label, return_inverse=True)
     chosen = best_pairs(Candidates(row, column, distance, (first[0] * len(labels) + label)[row]))
     return row[chosen], column[chosen], distance[chosen]
+
+
+def track_means(score: FloatArray, identity: IntArray) -> FloatArray:
+    """Mean score (N,) of each row's track. Summed track by track: thresholds compare scores to the last bit."""
+    order = np.argsort(identity, kind="stable")
+    counts = np.bincount(identity)
+    parts = np.split(score[order], np.cumsum(counts)[:-1]) if len(counts) else []
+    return np.array([np.mean(part) for part in parts], dtype=np.float64)[identity]

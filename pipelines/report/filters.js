@@ -3,7 +3,7 @@ const CONFIRMED = 3;  // moments at which a track was detected
 
 function makeFilters(scenes, thresholds, ghosts, changed, chosen) {  // chosen: one class alone, or all again
   const state = {confirmed: true, ghosts, byTrack: false, off: new Set(), thresholds: {...thresholds}};
-  const counted = new Map(), classColour = label => colourOf[label] ?? SOFT;  // a correction may bring a new class
+  const counted = new Map(), means = new Map(), classColour = label => colourOf[label] ?? SOFT;  // a correction may bring a new class
 
   function detectedMoments(result) {  // of each track of a result
     if (!counted.has(result)) {
@@ -14,11 +14,20 @@ function makeFilters(scenes, thresholds, ghosts, changed, chosen) {  // chosen: 
     return counted.get(result);
   }
 
+  function meanScores(result) {  // of each track, in thousandths: evaluations rank tracks by them
+    if (!means.has(result)) {
+      const sums = new Float64Array(result.ids.length), counts = new Float64Array(result.ids.length);
+      for (const rows of result.moments) for (const row of rows) { sums[row[ID]] += row[SCORE]; counts[row[ID]]++; }
+      means.set(result, sums.map((sum, id) => sum / counts[id]));
+    }
+    return means.get(result);
+  }
+
   const shownClass = (scene, label) => !state.off.has(scene.labels[label]);
 
   function rows(scene, name, k, followed) {
-    const result = scene.methods[name], counts = detectedMoments(result), least = 1000 * state.thresholds[name];
-    return result.moments[k].filter(row => row[ID] === followed || (row[SCORE] >= least && shownClass(scene, row[LABEL])
+    const result = scene.methods[name], counts = detectedMoments(result), score = meanScores(result), least = 1000 * state.thresholds[name];
+    return result.moments[k].filter(row => row[ID] === followed || (score[row[ID]] >= least && shownClass(scene, row[LABEL])
       && (state.ghosts || !(row[COASTING] > unseenFrom)) && (!state.confirmed || counts[row[ID]] >= CONFIRMED)));
   }
 
@@ -58,7 +67,7 @@ function makeFilters(scenes, thresholds, ghosts, changed, chosen) {  // chosen: 
       const say = () => { output.value = (+input.value).toFixed(2); };
       input.oninput = () => { state.thresholds[name] = +input.value; say(); changed(); };
       say();
-      label.append(`score${names.length > 1 ? ` of ${name}` : ""} from `, input, output);
+      label.append(`mean score${names.length > 1 ? ` of ${name}` : ""} from `, input, output);
       return label;
     }));
   }

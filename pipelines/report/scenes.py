@@ -283,13 +283,15 @@ def yields_data(
 
 
 def comparisons(report: ReportScene, thresholds: Mapping[str, float]) -> list[dict[str, Any]]:
-    """Return where each method differs from the truth, and from the methods before it, of scores from `thresholds` on.
+    """Return where each method differs from the truth, and from the methods before it.
+
+    The tracks count whose mean scores are at least the `thresholds`.
 
     Ready for JSON; see the module's docstring.
     """
     scene = report.scene
     origin = scene.world_T_ego[0, :2, 3] if len(scene) else np.zeros(2)
-    found = {name: table.select(table.score >= thresholds[name]) for name, table in report.tracks.items()}
+    found = {name: table.select(table.track_score >= thresholds[name]) for name, table in report.tracks.items()}
     references: dict[str | None, Sequence[Annotations]] = {}
     if scene.ground_truth is not None:
         references[None] = scene.ground_truth
