@@ -121,17 +121,20 @@ class TrackerOptions(MethodOptions):
 def family_of(source: DatasetSource, config: Path | None) -> str | Path:
     """The shipped settings that fit a dataset, which the file `config` lies over.
 
-    A table has those that `--like` names. One of dense traffic has its own, which is told, unless there is such a file:
-    its meaning depends on no data.
+    A table has those that `--like` names. One of dense traffic has its own, which is told. With such a file, whose
+    meaning depends on no data, it is told how to have them.
     """
     if not isinstance(source, DetectionFileSource):
         return source.family
     if source.like is not None:
         return "dense" if source.like == "dense" else source.family
-    why = source.dense_traffic() if config is None else ""
-    if why:
+    why = source.dense_traffic()
+    if why and config is None:
         typer.echo(f"settings for dense traffic: {why}; --like plain takes others", err=True)
-    return "dense" if why else source.family
+        return "dense"
+    if why:
+        typer.echo(f"{config}: over plain settings; {why}: --like dense takes those for dense traffic", err=True)
+    return source.family
 
 
 @dataclass(frozen=True)

@@ -464,5 +464,10 @@ def test_dense_traffic_is_recognised_unless_it_is_said_otherwise(tmp_path):
     assert saga_fg("track", "file", table, "--output", told).output.count(line) == 1
     saga_fg("track", "file", table, "--like", "dense", "--output", same)
     assert same.read_bytes() == told.read_bytes()
+    config = tmp_path / "c.yaml"
+    config.write_text("tracker: {max_coasting: 3.0}\n")
+    said = saga_fg("track", "file", table, "--config", config, "--output", tmp_path / "own.csv").output
+    assert f"{config}: over plain settings; 10 vehicles at a time with headings" in said
+    assert "--like dense takes those for dense traffic" in said
     assert "settings for" not in saga_fg("track", "file", table, "--like", "plain", "--output", same).output
     assert same.read_bytes() != told.read_bytes()
