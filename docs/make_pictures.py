@@ -53,7 +53,7 @@ def write_review_picture(picture: Path, folder: Path) -> None:
     subprocess.run([sys.executable, "-c", smooth, *options], check=True)
     run = read_label_run(folder)
     session = ReviewSession(folder, run, folder / CORRECTIONS)
-    with run.open() as dataset:
+    with run.open() as (_, dataset):
         start = float(dataset.scene("scene-0001").timestamps[0])
     state = session.state("scene-0001")
     row = next(row for row in state["rows"] if row["why"] == "box")
