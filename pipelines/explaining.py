@@ -17,6 +17,8 @@ from pipelines.tracking import OnlineTracker
 from saga_fg.errors import InputError
 from saga_fg.tracking import Event, Journal, SensorTime, of_scene
 
+PAUSE = 3.0  # s, after which one that yields to the same track again is told of anew
+
 
 def clock_text(name: str, clock: Mapping[str, Any], since: float | None = None) -> str:
     """The clock of a sensor, a `SensorTime` as JSON has it, in words; since: time of its first correction, s."""
@@ -93,8 +95,9 @@ def read_track(journal: Path, track: str, scene: str | None) -> tuple[list[Event
             events.append(event)
         elif event.get("event") == "yields" and events and str(event.get("scene")) == str(events[-1].get("scene")):
             own = {other: p for source, other, p in event["yields"] if source == number}
-            events += [event | {"track": number, "other": k, "p": p} for k, p in own.items() if k not in told]
-            told = own
+            new = {other: p for other, p in own.items() if event["time"] - told.get(other, -math.inf) > PAUSE}
+            events += [event | {"track": number, "other": other, "p": p} for other, p in new.items()]
+            told |= dict.fromkeys(own, event["time"])
     if not events:
         where = "" if scene is None else f" of scene {scene}"
         raise InputError(f"{journal}: expected events of track {number}{where}, there are none")
