@@ -32,9 +32,11 @@ import numpy as np
 import scipy.linalg
 
 from saga_fg.errors import InputError
-from saga_fg.model import AccelerationLaw, Attached, EdgeRule, Following, Neighbours, Pairs, discretise, held
+from saga_fg.model.discretisation import discretise
+from saga_fg.model.edge_rules import Attached, EdgeRule, Following, Neighbours, Pairs
 from saga_fg.model.interactions import POSITION, VELOCITY, NodeTable, Triples, applies, unit
 from saga_fg.model.motion import ConstantVelocity, NodeType, distinct_types
+from saga_fg.model.nonlinear_interactions import AccelerationLaw, held
 from saga_fg.model.scene_graph import Edges, NonlinearEdges, RecordedMotions, SceneGraph
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, checked, checked_rows, unchecked
 from saga_fg.settings import Range, Settings, setting, settings_group

@@ -89,8 +89,9 @@ import scipy.linalg
 
 from saga_fg.errors import InputError
 from saga_fg.kernels.paths import course_inputs, course_motions
-from saga_fg.model import POSITION, VELOCITY, ConstantAcceleration, ConstantVelocity, Curvilinear, NodeType
 from saga_fg.model.discretisation import discretise, linear_motions
+from saga_fg.model.interactions import POSITION, VELOCITY
+from saga_fg.model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NodeType
 from saga_fg.model.scene_graph import OwnMotions, SceneGraph
 from saga_fg.numerics import Columns, FloatArray, IntArray, unchecked
 from saga_fg.settings import NonNegative, Positive, Settings, setting, settings_group

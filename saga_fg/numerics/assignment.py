@@ -60,7 +60,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, chi_square_quantile
+from saga_fg.numerics.arrays import BoolArray, Columns, FloatArray, IntArray
+from saga_fg.numerics.geometry import chi_square_quantile
 
 _DENSE = 10_000  # pairs of rivals up to which one matrix of all is the fastest
 

@@ -50,7 +50,9 @@ from saga_fg.estimators import (
 from saga_fg.graph import OBJECT, Additions, FactorProvider, GraphView, key_of
 from saga_fg.model import VELOCITY, NodeType, SceneGraph, Transition, discretise
 from saga_fg.numerics import BoolArray, FloatArray, IntArray
-from saga_fg.smoothing import Evidence, Lifespans, OfflineClass, StateTable
+from saga_fg.smoothing.association import Evidence
+from saga_fg.smoothing.settings import OfflineClass
+from saga_fg.smoothing.states import Lifespans, StateTable
 from saga_fg.types import class_settings, class_values
 
 log = logging.getLogger(__name__)

@@ -33,7 +33,8 @@ from typing import NamedTuple
 import numpy as np
 
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, wrap_angle
-from saga_fg.smoothing import Evidence, Lifespans, StateTable
+from saga_fg.smoothing.association import Evidence
+from saga_fg.smoothing.states import Lifespans, StateTable
 
 
 class ScalarReadings(NamedTuple):

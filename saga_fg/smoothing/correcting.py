@@ -13,19 +13,12 @@ import numpy as np
 from saga_fg.graph import FactorProvider
 from saga_fg.model import FieldOfView, Sensor
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, near_pairs
-from saga_fg.smoothing import (
-    Evidence,
-    EvidenceFrame,
-    Lifespans,
-    StateTable,
-    StationaryStates,
-    assign_free_detections,
-    evidence_scores,
-    stationary_states,
-)
+from saga_fg.smoothing.association import Evidence, EvidenceFrame, assign_free_detections, evidence_scores
+from saga_fg.smoothing.batch_states import StationaryStates, stationary_states
 from saga_fg.smoothing.corrections import Correction, Place, WholeObject
 from saga_fg.smoothing.passes import ASSOCIATION_GATE, EXTENSION, MAX_FREE_DISTANCE, Passes, SmoothedObjects
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME, SmoothingSettings
+from saga_fg.smoothing.states import Lifespans, StateTable
 from saga_fg.tracking import TrackerSettings
 from saga_fg.types import Boxes
 

@@ -26,7 +26,8 @@ from typing import Any
 import numpy as np
 
 from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, near_pairs
-from saga_fg.smoothing import Evidence, Lifespans, Probabilities, StateTable
+from saga_fg.smoothing.association import Evidence
+from saga_fg.smoothing.states import Lifespans, Probabilities, StateTable
 from saga_fg.types import data_frame, text_table
 
 HANDED_OUT = 0.5  # P(exists)

@@ -19,19 +19,11 @@ from typing import Any, Protocol, get_args
 import numpy as np
 
 from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, wrap_angle
-from saga_fg.smoothing import (
-    Evidence,
+from saga_fg.smoothing.association import Evidence
+from saga_fg.smoothing.boxes import (
     Headings,
-    LabelCounts,
-    Labels,
-    OfflineClass,
-    Probabilities,
-    SmoothingSettings,
-    Source,
-    StateTable,
     constant_sizes,
     is_reversed,
-    quality_of,
     scalar_readings,
     size_weights,
     smooth_headings,
@@ -41,6 +33,8 @@ from saga_fg.smoothing import (
 from saga_fg.smoothing.corrections import WholeObject
 from saga_fg.smoothing.doubt import LEAST_GAIN, REASONS, Review, far_off, gain_parts, object_probabilities, step_doubt
 from saga_fg.smoothing.passes import SmoothedObjects
+from saga_fg.smoothing.settings import OfflineClass, SmoothingSettings
+from saga_fg.smoothing.states import LabelCounts, Labels, Probabilities, Source, StateTable, quality_of
 from saga_fg.types import Boxes, Tracks, class_values
 
 NEAR_CORRECTION = 1.0  # time to a corrected box up to which a label is near one, s

@@ -21,14 +21,12 @@ from saga_fg.graph import FactorProvider
 from saga_fg.model import Sensor
 from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.parts import new_part
-from saga_fg.smoothing import (
+from saga_fg.smoothing.association import (
     Evidence,
     assign_detections,
     assign_free_detections,
-    constant_sizes,
     evidence_scores,
     measured_in_order,
-    size_weights,
     stitch_tracklets,
 )
 from saga_fg.smoothing.batch_states import (
@@ -40,6 +38,7 @@ from saga_fg.smoothing.batch_states import (
     smooth_states,
     stationary_states,
 )
+from saga_fg.smoothing.boxes import constant_sizes, size_weights
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME, SmoothingSettings
 from saga_fg.smoothing.states import MEDIUM_SCORE, Lifespans, SmoothedEdges, StateTable
 from saga_fg.tracking import ClassSettings, GreedyTracker, Tracker, TrackerSettings

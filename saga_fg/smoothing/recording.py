@@ -31,15 +31,8 @@ from saga_fg.graph import FactorProvider
 from saga_fg.model import Sensor
 from saga_fg.numerics import BoolArray, FloatArray, IntArray
 from saga_fg.settings import Positive, Range, Settings, setting
-from saga_fg.smoothing import (
-    Evidence,
-    LabelCounts,
-    Labels,
-    gather_evidence,
-    measured_in_order,
-    opportunities,
-    size_weights,
-)
+from saga_fg.smoothing.association import Evidence, gather_evidence, measured_in_order, opportunities
+from saga_fg.smoothing.boxes import size_weights
 from saga_fg.smoothing.correcting import LATE, PERSON, correct_objects
 from saga_fg.smoothing.corrections import Correction, WholeObject, checked_corrections, corrections_in, unfit
 from saga_fg.smoothing.labelling import (
@@ -53,6 +46,7 @@ from saga_fg.smoothing.labelling import (
 )
 from saga_fg.smoothing.passes import SmoothedObjects, smooth_objects, track_evidence
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME, SmoothingSettings
+from saga_fg.smoothing.states import LabelCounts, Labels
 from saga_fg.tables import Table, TableImport, raw_table, scenes_of, table_like
 from saga_fg.tracking import UNKNOWN_SENSORS, GreedyTracker, Tracker, TrackerSettings, check_scenes, scaled_sensors
 from saga_fg.types import Frame

@@ -60,12 +60,13 @@ from saga_fg.numerics import (
     pair_costs,
 )
 from saga_fg.parts import of_own_code
-from saga_fg.tracking import AssociationProblem, AssociationSettings, ClassSettings, TrackerSettings, TrackerState
 from saga_fg.tracking.class_belief import NONE_CONFUSED, ConfusedClasses
 from saga_fg.tracking.identities import identity_cost
 from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
 from saga_fg.tracking.relinking import relinked
+from saga_fg.tracking.settings import AssociationProblem, AssociationSettings, ClassSettings, TrackerSettings
 from saga_fg.tracking.track_life import over_confirmed
+from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types import Boxes, class_values
 
 EXISTENCE_WEIGHT, SCORE_WEIGHT = 0.3, 0.5  # a and b above

@@ -41,11 +41,13 @@ from numpy.typing import ArrayLike
 from saga_fg.graph import EGO_ERROR, MAP_NODE, OBJECT, GraphVariable, SceneFactorGraph
 from saga_fg.model import EdgeEffect, NodeTable, SceneGraph, edge_effects
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, Matching, gate, mahalanobis
-from saga_fg.tracking import ClassSettings, TrackerSettings, TrackerState, TrackTable
 from saga_fg.tracking.clock import Clock
 from saga_fg.tracking.clock_offsets import SensorTime, SharedObservations, sensor_times
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.prediction import node_table
+from saga_fg.tracking.settings import ClassSettings, TrackerSettings
+from saga_fg.tracking.track_table import TrackTable
+from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.types import Boxes, class_settings
 
 Stage = Literal["predict", "measure", "associate", "update", "existence", "initiate", "delete", "report"]

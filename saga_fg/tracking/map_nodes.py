@@ -53,7 +53,9 @@ from saga_fg.model import (
     halting,
 )
 from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, assign, gate, mahalanobis, of_classes
-from saga_fg.tracking import ClassSettings, JointTrackState, Kinematics, TrackerSettings
+from saga_fg.tracking.joint_state import JointTrackState
+from saga_fg.tracking.settings import ClassSettings, TrackerSettings
+from saga_fg.tracking.track_filters import Kinematics
 from saga_fg.types import (
     COLOUR_LABELS,
     COLOURS,

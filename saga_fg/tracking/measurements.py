@@ -64,8 +64,9 @@ from saga_fg.numerics import (
     unchecked,
     yaw_of,
 )
-from saga_fg.tracking import ClassSettings, EgoNodeSettings, JointTrackState, TrackerSettings
 from saga_fg.tracking.class_belief import NONE_CONFUSED, ConfusedClasses
+from saga_fg.tracking.joint_state import JointTrackState
+from saga_fg.tracking.settings import ClassSettings, EgoNodeSettings, TrackerSettings
 from saga_fg.tracking.track_filters import MOVING, Kinematics, RelativePositions
 from saga_fg.types import COLOUR_LABELS, Boxes, Frame, class_settings, class_values
 

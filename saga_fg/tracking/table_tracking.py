@@ -43,7 +43,9 @@ from saga_fg.tables import (
     table_like,
     tell,
 )
-from saga_fg.tracking import AssociationSettings, ClassSettings, Tracker, TrackerSettings, TrafficSettings
+from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
+from saga_fg.tracking.tracker import Tracker
+from saga_fg.tracking.traffic import TrafficSettings
 from saga_fg.types import DEFAULT, Detections, Frame, Scene, SignalSettings, Tracks
 
 

@@ -61,10 +61,12 @@ import numpy as np
 
 from saga_fg.kernels.components import biased_covariances
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, Matching, unchecked
-from saga_fg.tracking import ExistenceSettings, TrackerState, TrackTable
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.relinking import CONFIRMING, initiating, relinkable
+from saga_fg.tracking.settings import ExistenceSettings
 from saga_fg.tracking.track_filters import BoxFilter, Kinematics, Stationarity, TurnRate, after_evidence, log_density
+from saga_fg.tracking.track_table import TrackTable
+from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.update import update_range_rates
 from saga_fg.types import Boxes, Tracks, paired_bev_iou, touching_pairs
 

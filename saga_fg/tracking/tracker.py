@@ -25,14 +25,16 @@ from saga_fg.graph import FactorProvider, ProviderError, SceneFactorGraph, Undet
 from saga_fg.model import SceneGraph, Sensor, checked_sensors, sensor_model
 from saga_fg.numerics import Assignment, FloatArray, IntArray, StrArray
 from saga_fg.parts import KINDS, in_one_line, new_part
-from saga_fg.tracking import Observer, Stage, TimeVerdict, TrackerSettings, TrackerView
 from saga_fg.tracking.association import associate
 from saga_fg.tracking.by_name import estimator_name
+from saga_fg.tracking.clock import TimeVerdict
 from saga_fg.tracking.clock_offsets import SensorTime, compared, sensor_times
+from saga_fg.tracking.journal import Observer, Stage, TrackerView
 from saga_fg.tracking.map_nodes import MapNodes
 from saga_fg.tracking.measurements import UNMEASURED, for_gates, frame_measurements, observed, with_scale
 from saga_fg.tracking.prediction import judge_edges, look_ahead, predict
 from saga_fg.tracking.relinking import hand_over
+from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.track_life import delete_tracks, initiate_tracks, report_tracks, resolve_tracks
 from saga_fg.tracking.tracker_state import TrackerSnapshot, TrackerState
 from saga_fg.tracking.update import (

@@ -24,8 +24,8 @@ from saga_fg.kernels.components import velocities_along
 from saga_fg.model import POSITION, SceneGraph, Sensor
 from saga_fg.numerics import Assignment, BoolArray, CrossCovariances, FloatArray, IntArray, StrArray, shallow_copy
 from saga_fg.parts import new_part
-from saga_fg.tracking import AssociationCost, ClassSettings, ConfusedClasses, Kinematics, TrackerSettings, TrackTable
 from saga_fg.tracking.by_name import new_estimator
+from saga_fg.tracking.class_belief import ConfusedClasses
 from saga_fg.tracking.clock import Clock, TimeVerdict
 from saga_fg.tracking.clock_offsets import SharedObservations
 from saga_fg.tracking.edge_record import EdgeRecord, HaltingPlaces
@@ -34,6 +34,9 @@ from saga_fg.tracking.joint_state import JointTrackState, moved_to_present, past
 from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
 from saga_fg.tracking.measurements import EgoNode, SensorNoise
 from saga_fg.tracking.right_of_way import RightOfWay
+from saga_fg.tracking.settings import AssociationCost, ClassSettings, TrackerSettings
+from saga_fg.tracking.track_filters import Kinematics
+from saga_fg.tracking.track_table import TrackTable
 from saga_fg.tracking.traffic import Traffic, speed_prior
 from saga_fg.types import MAP_CLASSES, Boxes, Frame, class_values
 

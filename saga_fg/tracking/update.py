@@ -65,10 +65,11 @@ import numpy as np
 from factors import RangeRate
 from saga_fg.model import POSITION, VELOCITY, own_motion
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, Matching, StrArray, chi_square_quantile, wrap_angle
-from saga_fg.tracking import MOVING, Kinematics, Passages
 from saga_fg.tracking.joint_state import moved_to_present
 from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
+from saga_fg.tracking.track_filters import MOVING, Kinematics
 from saga_fg.tracking.tracker_state import LIFETIME, TrackerState
+from saga_fg.tracking.traffic import Passages
 from saga_fg.types import Boxes
 
 HIDING = 0.25  # share of covered objects that are hidden; detected are 0.73 to 0.84 of the cars that are detected

@@ -16,7 +16,8 @@ import numpy as np
 
 from saga_fg.errors import InputError
 from saga_fg.numerics import BoolArray, FloatArray, StrArray, checked, checked_labels, checked_transform
-from saga_fg.types import Boxes, Frame
+from saga_fg.types.boxes import Boxes
+from saga_fg.types.frame import Frame
 
 
 @dataclass(frozen=True, eq=False)

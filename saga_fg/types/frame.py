@@ -31,7 +31,9 @@ from saga_fg.numerics import (
     from_upper_triangle,
     upper_triangle,
 )
-from saga_fg.types import MAX_POSITION, MAX_SPEED, Boxes, RoadMap, html_table, text_table
+from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
+from saga_fg.types.road_map import RoadMap
+from saga_fg.types.track import html_table, text_table
 
 if TYPE_CHECKING:  # frames bring observations of landmarks, and are read before anything is estimated
     import gtsam
