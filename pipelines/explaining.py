@@ -117,12 +117,11 @@ def clock_lines(events: Sequence[Event]) -> list[str]:
 
 
 def read_graphs(journal: Path) -> dict[str, list[Event]]:
-    """Read the graphs of all frames, in order of time, by scene. Raises `InputError` as `read_events`."""
-    graphs: dict[str, list[Event]] = {}
-    for event in read_events(journal):
-        if event.get("event") == "graph":
-            graphs.setdefault(str(event.get("scene")), []).append(event)
-    return graphs
+    """Read the graphs of all frames, in order of time, by scene; none where there is no journal.
+
+    Raises `InputError` for a broken one.
+    """
+    return _by_scene(journal, "graph")
 
 
 def read_yields(journal: Path) -> dict[str, dict[float, list[list[Any]]]]:
@@ -130,11 +129,16 @@ def read_yields(journal: Path) -> dict[str, dict[float, list[list[Any]]]]:
 
     Raises `InputError` for a broken one.
     """
-    found: dict[str, dict[float, list[list[Any]]]] = {}
+    found = _by_scene(journal, "yields")
+    return {scene: {event["time"]: event["yields"] for event in events} for scene, events in found.items()}
+
+
+def _by_scene(journal: Path, kind: str) -> dict[str, list[Event]]:
+    events: dict[str, list[Event]] = {}
     for event in read_events(journal) if journal.exists() else ():
-        if event.get("event") == "yields":
-            found.setdefault(str(event.get("scene")), {})[event["time"]] = event["yields"]
-    return found
+        if event.get("event") == kind:
+            events.setdefault(str(event.get("scene")), []).append(event)
+    return events
 
 
 def read_events(journal: Path) -> Iterator[Event]:

@@ -112,7 +112,7 @@ def _show(
     else:
         view.check_view_file(save)
     with working("making the view"):
-        graphs = read_graphs(journal_of(result)) if journal_of(result).exists() else {}
+        graphs = read_graphs(journal_of(result))
         scenes = [replace(each, graphs=graphs.get(each.report.scene.name, ())) for each in make()]
         driven = view.read_slam_view(slam) if slam is not None else None
         roots = [each.report.scene.name for each in scenes]

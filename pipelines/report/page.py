@@ -162,12 +162,16 @@ def as_recorded(source: DatasetSource, result: Path) -> DatasetSource:
 
 @dataclass(frozen=True, eq=False)
 class _Result:
-    """A result that has been read: of a method, by scene, with the record of its run where there is one."""
+    """A result that has been read: of a method, by scene, with the record of its run where there is one.
+
+    yields  who yielded to whom, by scene and time, s: of its journal, for pages
+    """
 
     method: str
     path: Path
     found: Results
     record: RunRecord | None
+    yields: Mapping[str, Mapping[float, Sequence[Sequence[Any]]]] = field(default_factory=dict)
 
 
 def result_report(source: DatasetSource, result: Path, beside: Path | None = None, images: int = 0) -> Report:
@@ -226,7 +230,8 @@ def result_scenes(source: DatasetSource, result: Path, found: Results) -> list[R
 
 def _read(source: DatasetSource, path: Path) -> _Result:
     record = read_run_record(path)
-    return _Result(record.method if record is not None else path.stem, path, source.read_results(path), record)
+    method, yields = path.stem if record is None else record.method, read_yields(journal_of(path))
+    return _Result(method, path, source.read_results(path), record, yields)
 
 
 def _with_distinct_names(one: _Result, other: _Result) -> list[_Result]:
@@ -240,7 +245,6 @@ def _with_distinct_names(one: _Result, other: _Result) -> list[_Result]:
 
 def _scenes(source: DatasetSource, result: _Result) -> list[ReportScene]:
     config, predicted = load_config(source.family), read_predictions(result.path)
-    yields = read_yields(journal_of(result.path))
     return [
         ReportScene(
             each.scene,
@@ -249,7 +253,7 @@ def _scenes(source: DatasetSource, result: _Result) -> list[ReportScene]:
             config.tracker.edges,
             config.sensors,
             {result.method: predicted[name]} if name in predicted else {},
-            yields={result.method: yields.get(name, {})},
+            yields={result.method: result.yields.get(name, {})},
         )
         for name, each in result.found.scenes.items()
     ]
@@ -276,6 +280,7 @@ def _joined(scene: ReportScene, result: _Result, other: ReportScene | None) -> R
         tracks={**other.tracks, **scene.tracks},
         coasting={**other.coasting, **scene.coasting},
         predictions={**other.predictions, **scene.predictions},
+        yields={**other.yields, **scene.yields},
     )
 
 

@@ -146,6 +146,7 @@ Rows = list[list[int | None]]
 Edges = tuple[IntArray, IntArray, FloatArray, IntArray]
 """Targets and sources (E,), rows of the table, rates (E,), 1/s, and numbers (E,) of the rules that found them."""
 SWITCH, UNMATCHED, ADDED = range(3)
+_SAME_TIME = 1e-4  # s
 MOVING = 2.0  # m/s, from which a track has moved
 VELOCITY_VARIANCE = 1.0  # (m/s)^2, results do not give it
 UNMEASURED = 1.0  # side of the cube an object of unknown size is drawn as, m
@@ -272,11 +273,11 @@ def yields_data(
     found: Mapping[float, Sequence[Sequence[Any]]], ids: Sequence[str], times: FloatArray, relation: int
 ) -> list[Rows]:
     """Return at each moment which of the tracks yield to which, as edges of the kind `relation`."""
-    number = {id_.rpartition("-")[2]: k for k, id_ in enumerate(ids)}  # nuScenes: SCENE-NUMBER
+    number = _numbers(ids)
     moments: list[Rows] = [[] for _ in times]
     for time, rows in found.items():
-        k = int(np.searchsorted(times, time - 1e-4))
-        if k < len(times) and times[k] < time + 1e-4:
+        k = int(np.searchsorted(times, time - _SAME_TIME))
+        if k < len(times) and times[k] < time + _SAME_TIME:
             known = ((number.get(str(a)), number.get(str(b)), round(1000 * p), relation) for a, b, p in rows)
             moments[k] = [list(row) for row in known if None not in row]
     return moments
@@ -341,8 +342,7 @@ def predictions_data(
     """Return the predictions of the tracks of a table; see the module's docstring."""
     if found is None:
         return {"horizons": [], "predictions": []}
-    known = np.unique(table.id)
-    number = {id_.rpartition("-")[2]: k for k, id_ in enumerate(known.tolist())}  # nuScenes: SCENE-NUMBER
+    number = _numbers(np.unique(table.id).tolist())
     ids = np.array([number.get(id_, -1) for id_ in found.id.tolist()], dtype=np.int64)
     found, ids = found.select(ids >= 0), ids[ids >= 0]
     P = found.covariance
@@ -354,9 +354,14 @@ def predictions_data(
     ]
     order = np.lexsort((found.horizon, ids, found.timestamp))
     rows = _whole(np.column_stack(columns)[order])
-    starts = np.searchsorted(found.timestamp[order], [*(times - 1e-4), np.inf]).tolist()
+    starts = np.searchsorted(found.timestamp[order], [*(times - _SAME_TIME), np.inf]).tolist()
     horizons = np.unique((1000 * found.horizon).round()).astype(np.int64)
     return {"horizons": horizons.tolist(), "predictions": [rows[a:b] for a, b in pairwise(starts)]}
+
+
+def _numbers(ids: Sequence[str]) -> dict[str, int]:
+    """The rows of tracks by the tracker's own numbers: nuScenes has SCENE-NUMBER."""
+    return {id_.rpartition("-")[2]: k for k, id_ in enumerate(ids)}
 
 
 def _box_columns(boxes: Boxes, labels: StrArray, origin: FloatArray) -> FloatArray:

@@ -244,6 +244,18 @@ def test_two_results_stand_side_by_side(folder):
     assert {"saga: Tracks at a time", "kf: Tracks at a time"} <= {chart["title"] for chart in data["charts"]}
 
 
+def test_who_yields_is_shown_of_both_results(folder):
+    for method, p in (("saga", 0.75), ("kf", 0.85)):
+        event = {"event": "yields", "scene": "d", "time": 1.0, "yields": [[1, 2, p]]}
+        (folder / f"{method}.csv.journal.jsonl").write_text(json.dumps(event))
+    assert report(folder, "--beside", folder / "kf.csv").exit_code == 0
+    methods = data_of((folder / "page.html").read_text(encoding="utf-8"))["scenes"][0]["methods"]
+    for method, share in (("saga", 750), ("kf", 850)):
+        relation = methods[method]["relations"].index("yields to")
+        found = [row for moment in methods[method]["edges"] for row in moment if row[3] == relation]
+        assert found == [[0, 1, share, relation]]
+
+
 def test_results_of_one_method_are_told_apart_by_their_files(folder):
     (folder / "other").mkdir()
     for name in ("saga.csv", "saga.run.json"):
