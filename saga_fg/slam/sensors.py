@@ -55,7 +55,6 @@ class SensorBuffer:
         self._newest: dict[str, float] = {}
         self._taken = -math.inf
         self._silent: set[str] = set()
-        self._regular: set[str] = set()  # sensors with two measurements at least
 
     def add_imu(self, time: float, acceleration: FloatArray, angular_rate: FloatArray) -> None:
         """Specific force (3,), m/s^2, and turn rate (3,), rad/s, at `time`, s, for the time since the sample before."""
@@ -97,6 +96,7 @@ class SensorBuffer:
             return np.empty(0), np.empty((0, 0))
         time, length, value = (np.array(column) for column in zip(*kept, strict=True))
         self._kept[sensor] = kept[max(int(np.searchsorted(time, until, side="right")) - 1, 0) :]
+        length[np.isinf(length)] = _LONGEST
         start, end = time - length, time.copy()
         if since < time[-1] <= until:
             end[-1] += min(until - end[-1], length[-1])
@@ -110,14 +110,13 @@ class SensorBuffer:
         return spans[used], value[used]
 
     def _add(self, sensor: str, time: float, value: FloatArray) -> None:
-        """Keep a measurement and the time that it stands for, s; of the first, that is known from the second on."""
+        """Keep a measurement and the time that it stands for, s; of the first, that is infinite until the second."""
         self._in_order(sensor, time)
-        kept, length = self._kept[sensor], _LONGEST
+        kept, length = self._kept[sensor], math.inf
         if kept:
             before, usual, other = kept[-1]
             length = time - before
-            if sensor not in self._regular:
-                self._regular.add(sensor)
+            if math.isinf(usual):
                 length = min(length, _LONGEST)
                 kept[-1] = before, length, other
             elif length > _GAP * usual:
