@@ -5,6 +5,7 @@ Linear families give native `gtsam.JacobianFactor`s, or many of one shape as `Ga
 (ranges, bearings, places, attitudes, priors) is taken from it as it is.
 """
 
+from factors.between import ERROR_DIM, Pose, between_factor, noise_model, odometry_factors, pose, pose_prior_factor
 from factors.gaussian import (
     GaussianFactors,
     check_dimensions,
@@ -31,19 +32,9 @@ from factors.measurement import (
     RangeRate,
     detection_factors,
 )
-from factors.nonlinear import Mixture, ResidualFactors, Robust, RobustLoss, residual_factor
-from factors.poses import (
-    ERROR_DIM,
-    Pose,
-    between_factor,
-    noise_model,
-    odometry_factors,
-    plane,
-    plane_factor,
-    pose,
-    pose_prior_factor,
-    relative_factors,
-)
+from factors.nonlinear import ResidualFactors, residual_factor
+from factors.relative import plane, plane_factor, relative_factors
+from factors.robust import Mixture, Robust, RobustLoss
 from factors.solver import Linearisable, Solution, SolverSettings, linearised, solve
 from factors.validation import FactorError, SingularSystemError
 

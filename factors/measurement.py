@@ -40,7 +40,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from factors.nonlinear import ResidualFactors, RobustLoss, residual_factors
+from factors.nonlinear import ResidualFactors, residual_factors
+from factors.robust import RobustLoss
 from factors.validation import FactorError, FloatArray, checked, checked_key_array
 
 

@@ -30,7 +30,7 @@ from factors import (
     residual_factor,
 )
 from factors.manifolds import Manifold
-from factors.nonlinear import each_of
+from factors.robust import each_of
 from factors.validation import format_key
 from saga_fg.errors import InputError
 from saga_fg.graph.factor_groups import FactorGroup, HeldGroup, LinearGroup, NativeGroup, ResidualGroup, members

@@ -10,7 +10,7 @@ States of all objects at all moments of a recording, given all of its detections
 over one factor graph (`saga_fg.estimators.RecordingSmoother`; long recordings in windows, which comes to the same
 within a millimetre and does not keep all matrices of an hour; with factors of users' own the running graph itself). The
 edges of an interval follow from given states at its start: those of an earlier, simpler pass. Robust losses
-(`factors.nonlinear`) are reached by reweighting between passes.
+(`factors.robust`) are reached by reweighting between passes.
 
 The velocity of a stationary object is zero with the covariance d^2/dt in every interval dt, by which its position
 wanders by d in a second, whatever the rate of frames: as far as the vehicle's own poses drift. A recording of one

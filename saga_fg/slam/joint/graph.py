@@ -3,9 +3,9 @@
 Factors of a record: poses of the vehicle, errors of its odometry, and states of objects, over time.
 
     prior        first pose; first errors; velocity of a new object
-    odometry     poses and errors of two epochs            (`factors.poses`)
+    odometry     poses and errors of two epochs            (`factors.between`)
     interaction  an object's next state and the states of all that act on it
-    detection    a pose and an object's state              (`factors.poses`), robust
+    detection    a pose and an object's state              (`factors.relative`), robust
     stationary   p' - p ~ N(0, stationary_drift^2 dt),  v' ~ N(0, stationary_speed^2)     with probability P
 
 The last one is the hybrid part of the model. With the probability P (`saga_fg.slam.joint.record`) an object is

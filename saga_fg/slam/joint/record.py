@@ -12,7 +12,7 @@ Per interval of dt s and d m, an increment a_T_b has independent noise
     translation  distance_noise^2 d + time_noise^2 dt,  every direction
 
 and three slow errors, a scale of the distance, a bias of the yaw rate and an angle of the course, which start as
-N(0, scale^2), N(0, bias^2), N(0, course^2) and wander as random walks (see `factors.poses`).
+N(0, scale^2), N(0, bias^2), N(0, course^2) and wander as random walks (see `factors.between`).
 
 Stationarity of objects: the probability that each one is at rest, from its detections along a path.
 
@@ -451,7 +451,7 @@ def _probabilities(seen: _PlacedDetections, slow: SlowErrors, settings: JointSet
 
 
 def _log_likelihoods(variances: FloatArray, d2: FloatArray) -> FloatArray:
-    """Of each hypothesis (K, N), but for a constant: variances (K, 2, N) of distances whose squares are d2 (2, N)."""
+    """Log-likelihoods (K, N) of hypotheses but for a constant: variances (K, 2, N), squares of distances d2 (2, N)."""
     return np.asarray(-(np.log(variances) + d2 / variances).sum(axis=1) / 2)
 
 
