@@ -226,7 +226,7 @@ def label_model(
     corrections: Sequence[Correction] = (),
     providers: Sequence[FactorProvider] = (),
 ) -> LabelModel:
-    """What the labels of a recording follow from."""
+    """Return everything that determines the labels of a recording."""
     tracker = config.tracking.of_method(method).tracker
     return LabelModel(tracker, config.sensors, config.smoothing, providers, corrections)
 

@@ -283,7 +283,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """What to take of a recording.
+    """Selection of the scans and sensors of a recording.
 
     sequence  one of several in the source, such as a sequence of KITTI or a scene of nuScenes
     period    s between scans whose times are unknown

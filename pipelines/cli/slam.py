@@ -91,7 +91,7 @@ class SourceOptions:
 
 @dataclass(frozen=True)
 class DriveOptions:
-    """What of a drive goes into the graph."""
+    """Landmarks and objects as nodes of the graph."""
 
     landmarks: Annotated[
         bool, typer.Option("--landmarks/--no-landmarks", help="Walls and poles as nodes of the graph.")

@@ -172,7 +172,7 @@ def structure(type_: str) -> Any:
 
 @cache
 def _sample_type(type_: str) -> Any:
-    """The same type, whose samples are the payload `data` as it is."""
+    """Return the type of a topic whose samples hold the serialised payload `data`."""
     kind = structure.__wrapped__(type_)
     kind.serialize = lambda sample, **_: sample.data
     kind.deserialize = kind.deserialize_key = partial(_sample, kind)

@@ -265,7 +265,7 @@ class IndependentVariables:
 
 
 def uncoupled(graph: SceneFactorGraph, x: BlockGaussian, nodes: Collection[int]) -> dict[int, set[int]]:
-    """Those of some `nodes` that are no longer correlated with anything in a graph, with the keys of their variables.
+    """Find the `nodes` that are no longer correlated with anything in a graph, with the keys of their variables.
 
     x: the joint Gaussian of what the graph has at its newest epoch
     """

@@ -159,8 +159,8 @@ _MIN_RATE = 1e-9  # 1/s, so that nothing is divided by 0
 
 
 class Unseen(NamedTuple):
-    """Of n nodes that are not seen: settling and pull (n,) as in `KnownCourses`, variance across (n,) of the velocity
-    across, (m/s)^2."""
+    """Motion of n hidden nodes: settling and pull (n,) as in `KnownCourses`, variance across (n,) of the lateral
+    velocity, (m/s)^2."""
 
     settling: FloatArray
     across: FloatArray

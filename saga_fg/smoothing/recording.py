@@ -143,8 +143,8 @@ class Backlog:
 
 @dataclass(frozen=True, eq=False)
 class LabelModel:
-    """What labels follow from: settings of the tracker, of the sensors offline and of smoothing, providers of factors
-    in place of those that the settings name, and corrections."""
+    """Everything that determines labels: settings of the tracker, of the sensors offline and of smoothing, providers of
+    factors in place of those that the settings name, and corrections."""
 
     tracker: TrackerSettings
     sensors: Mapping[str, Sensor] = field(default_factory=dict)

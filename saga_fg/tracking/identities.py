@@ -120,12 +120,12 @@ class Encounters(Columns):
         return cls(np.empty((0, 2), dtype=np.int64), np.empty((0, 4, 4)), np.empty((0, 4, 4, 4)), flat, flat)
 
     def live(self, tracks: IntArray, time: float) -> Self:
-        """Those that are open at a time, s, of the tracks (n,) that are left."""
+        """Select the encounters between present `tracks` (n,) that are still undecided at a time, s."""
         there = np.isin(self.ids, tracks).all(axis=1)
         return self.select(there & (time - self.since <= MEMORY) & (self.log_odds > UNLIKELY))
 
     def without(self, a: int, b: int) -> Self:
-        """Those of neither of two tracks."""
+        """Select the encounters without tracks a and b."""
         return self.select(np.asarray(~np.isin(self.ids, [a, b]).any(axis=1)))
 
     def begun(self, ids: IntArray, x: FloatArray, P: FloatArray, time: float) -> Self:

@@ -15,8 +15,6 @@ smoothed over `SMOOTHING` s. V, w are fitted to simulated crossings and merges o
 `python -m benchmarks right-of-way --fit`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -101,7 +99,7 @@ class RightOfWay:
     def observed(
         self, nodes: NodeTable, paths: Paths, lines: Lines, time: float
     ) -> tuple[Self, list[Pair], FloatArray]:
-        """What is remembered at a `time`, s, the pairs of vehicles that meet, by id, and their evidence (E, F).
+        """Return the new memory at a `time`, s, the pairs of ids of vehicles that meet, and their evidence (E, F).
 
         lines  where earlier traffic halted
         """

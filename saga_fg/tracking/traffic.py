@@ -268,7 +268,7 @@ class Traffic:
         self._next_lane -= len(new)
 
     def passes_beside(self, heading: FloatArray, position: FloatArray) -> BoolArray:
-        """Whether traffic of a heading (n,), rad, has passed beside places (n, 2), world, m, and none through them."""
+        """True (n,) where traffic of a heading (n,), rad, passed beside places (n, 2), world, m, none through them."""
         points = self.trails().points
         ahead, aside = ahead_and_aside(points.position - position[:, None], unit(heading)[:, None])
         alike = (np.abs(ahead) < SPACING) & (np.cos(points.heading - heading[:, None]) > np.cos(TURN))

@@ -118,7 +118,7 @@ class Yields:
         return len(self.source)
 
     def between(self, ids: IntArray) -> Self:
-        """Those of which both tracks are among the `ids` (n,)."""
+        """Select the pairs whose tracks are both among the `ids` (n,)."""
         kept = np.isin(self.source, ids) & np.isin(self.target, ids)
         return type(self)(self.source[kept], self.target[kept], self.probability[kept])
 
