@@ -153,6 +153,25 @@ def test_a_users_file_lies_over_the_shipped_defaults(tmp_path):
     assert config.greedy == load_config("kitti").greedy
 
 
+def test_a_mistake_in_a_users_file_names_file_and_key(tmp_path):
+    path = tmp_path / "mine.yaml"
+    for text, message in [
+        (
+            "tracker: {existence: {delete_belw: 0.3}}",
+            "tracker.existence.delete_belw: unknown key, did you mean 'delete_below'?",
+        ),
+        ("sensors: {lidar: {extrinsics: {x: .nan}}}", "sensors.lidar.extrinsics: x: expected a finite number, got nan"),
+        (
+            "sensors: {lidar: {extrinsics: {yaw: .inf}}}",
+            "sensors.lidar.extrinsics: yaw: expected a finite number, got inf",
+        ),
+    ]:
+        path.write_text(text)
+        with pytest.raises(InputError) as caught:
+            load_config("nuscenes", path)
+        assert str(caught.value) == f"{path}: {message}"
+
+
 def test_every_setting_explains_itself():
     for settings in [TrackConfig, SimulatorSettings]:
 
