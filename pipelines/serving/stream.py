@@ -13,7 +13,7 @@ import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from itertools import count
 from typing import Any, Generic, Literal, Protocol, TypeVar
@@ -124,11 +124,20 @@ class Numbering:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a state, without held frames."""
+        """Go on from a state, without held frames. Raises `InputError` for numbers that are none."""
+        for name in ("last", "taken", "unconfirmed"):
+            _require_whole(name, state[name].values())
+        for numbers in state["open"].values():
+            _require_whole("open", numbers)
         self.last, self.taken = dict(state["last"]), Counter(state["taken"])
         self._open = {sensor: set(numbers) for sensor, numbers in state["open"].items()}
         self._unconfirmed = dict(state["unconfirmed"])
         self._held = {}
+
+
+def _require_whole(name: str, numbers: Iterable[object]) -> None:
+    if not all(type(number) is int for number in numbers):
+        raise InputError(f"{name}: expected whole numbers")
 
 
 T = TypeVar("T")
@@ -319,12 +328,11 @@ class StreamTracker(Generic[Client]):
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a state. Raises `InputError` for counts that are none."""
         counts = Counter(state["counts"])
-        if not all(type(count) is int for count in counts.values()):
-            raise InputError("counts: expected whole numbers")
+        _require_whole("counts", counts.values())
         with self._lock:
             self._tracker.restore(state["tracker"])
             self._numbering.restore(state["numbering"])
-            self._held.set_clock(state["newest"])
+            self._held.set_clock(float(state["newest"]))
             self.counts = counts
             self._durable = self._numbering.durable()
 

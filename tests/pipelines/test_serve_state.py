@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pipelines.config import load_config
@@ -237,6 +238,17 @@ def test_a_state_that_does_not_fit_is_never_half_used(tmp_path):
         write_state(path, HEADER, state)
         with pytest.raises(InputError, match="expected a state that fits"):
             kept(stream(), path)
+
+
+@pytest.mark.parametrize("part", ["last", "taken", "open", "unconfirmed"])
+def test_numbers_of_frames_that_are_none_are_refused(tmp_path, part):
+    service, path = stream(), tmp_path / "state.saga"
+    file_sent(service, 0, 1)
+    state, _, _ = service.state()
+    state["numbering"][part] = {"a": [np.array([1])] if part == "open" else np.array([1])}
+    write_state(path, HEADER, state)
+    with pytest.raises(InputError, match=f"{part}: expected whole numbers"):
+        kept(stream(), path)
 
 
 def test_values_that_no_service_writes_are_refused(tmp_path, subtests):
