@@ -15,7 +15,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -140,10 +140,10 @@ def _predicted(
     """The tracks at times after a moment; none where the newest frame is too far from it."""
     if isinstance(tracker, GreedyTracker):
         raise InputError("--predict: expected a method that predicts, saga or kf")
-    since = np.asarray(horizons + (moment - newest))
+    since = horizons + (moment - newest)
     if since[0] < 0 or since[-1] > LONGEST_PREDICTION:
         return ()
-    return (replace(tracker.predict(since), timestamp=moment, horizons=horizons),)
+    return (tracker.predict(horizons, since=moment),)
 
 
 def track_dataset(

@@ -8,7 +8,7 @@ from .model.sensor import GroundCamera, Sensor
 from .smoothing import smooth
 from .tables.column_names import TableImport
 from .tables.detections import frames_of
-from .tracking import GreedyTracker, IdentityTracker, Tracker, TrackerSettings, track
+from .tracking import GreedyTracker, IdentityTracker, Tracker, TrackerSettings, predict, track
 from .types.boxes import Boxes
 from .types.dataset import Annotations, Dataset, Scene
 from .types.frame import Detection, Detections, Frame
@@ -49,6 +49,7 @@ __all__ = [
     "UnknownNodeError",
     "evaluate",
     "frames_of",
+    "predict",
     "smooth",
     "track",
     "view",

@@ -20,6 +20,7 @@ A false object is one error, and so are a wrong class and a wrong join; every bo
 Boxes without a heading are not turned round.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +29,7 @@ import numpy as np
 from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, near_pairs
 from saga_fg.smoothing.association import Evidence
 from saga_fg.smoothing.states import Lifespans, Probabilities, StateTable
-from saga_fg.types import data_frame, text_table
+from saga_fg.types import ShownTable, data_frame
 
 HANDED_OUT = 0.5  # P(exists)
 LEAST_GAIN = 0.05  # of an object that is worth a look
@@ -149,7 +150,7 @@ def object_probabilities(
 
 
 @dataclass(frozen=True, eq=False)
-class Review(Columns):
+class Review(Columns, ShownTable):
     """Objects, those first that are most worth a look: each (n,).
 
     id, label, boxes  name, class and number of boxes
@@ -180,9 +181,8 @@ class Review(Columns):
         """Return a `pandas.DataFrame` of `table_columns`. Needs the extra `pandas`."""
         return data_frame(self.table_columns())
 
-    def __str__(self) -> str:
-        rows = list(zip(*(column.tolist() for column in self.table_columns().values()), strict=True))
-        return text_table(f"{len(self)} objects", list(self.table_columns()), rows)
+    def _shown(self) -> tuple[str, Mapping[str, Any]]:
+        return f"{len(self)} objects", self.table_columns()
 
 
 REASONS = np.array(["false", "missing", "class", "identity", "heading", "box"])

@@ -47,8 +47,8 @@ from saga_fg.smoothing.labelling import (
 from saga_fg.smoothing.passes import SmoothedObjects, smooth_objects, track_evidence
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME, SmoothingSettings
 from saga_fg.smoothing.states import LabelCounts, Labels
-from saga_fg.tables import Table, TableImport, raw_table, scenes_of, table_like
-from saga_fg.tracking import UNKNOWN_SENSORS, GreedyTracker, Tracker, TrackerSettings, check_scenes, scaled_sensors
+from saga_fg.tables import Table, TableImport, table_like
+from saga_fg.tracking import GreedyTracker, Tracker, TrackerSettings, read_scenes, scaled_sensors
 from saga_fg.types import Frame
 
 MIN_LENGTH = 5.0  # s, of a chunk that ends early: below the margins at its ends, which are smoothed again, take over
@@ -438,20 +438,16 @@ def smooth(
     Warns (`UserWarning`) as `saga_fg.track` does, and of each correction that does not hold. Raises `InputError` for a
     table or a correction that can't be used.
     """
-    how = how or TableImport()
-    settings = TrackerSettings(min_hits=2) if settings is None else settings
-    given, sensors = checked_corrections(corrections), UNKNOWN_SENSORS if sensors is None else sensors
-    raw = raw_table(detections, how)
-    scenes = scenes_of(raw)
-    check_scenes(raw, scenes, settings, sensors)
+    given = checked_corrections(corrections)
+    found = read_scenes(detections, how or TableImport(), settings or TrackerSettings(min_hits=2), sensors)
     labels, outcomes = {}, []
-    for scene in scenes:
+    for scene in found.scenes:
         mine = corrections_in(scene.name, given)
-        model = LabelModel(settings, sensors, smoothing or SmoothingSettings(), (), mine)
-        builder = LabelBuilder(Tracker(settings, sensors), model)
+        model = LabelModel(found.settings, found.sensors, smoothing or SmoothingSettings(), (), mine)
+        builder = LabelBuilder(found.new_tracker(), model)
         builder.add(scene.frames, scene.timestamps)
         labels[scene.name], _ = builder.finish()
         outcomes += [(one.origin, why) for one, why in builder.outcomes]
     for problem in unfit(given, outcomes):
         warnings.warn(problem, stacklevel=2)
-    return TableLabels(labels, detections, "scene" in raw.columns)
+    return TableLabels(labels, detections, found.is_named)

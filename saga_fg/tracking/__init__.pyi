@@ -7,7 +7,6 @@ from .joint_state import JointTrackState
 from .journal import Event, Journal, Observer, Stage, TrackerView, of_scene
 from .map_nodes import motion_of
 from .measurements import frame_measurements, scaled_sensors
-from .prediction import predict
 from .settings import (
     AssociationCost,
     AssociationName,
@@ -19,7 +18,7 @@ from .settings import (
     TrackerSettings,
     TypicalSize,
 )
-from .table_tracking import UNKNOWN_SENSORS, IdentityTracker, check_scenes, dense_traffic_settings, track
+from .table_tracking import IdentityTracker, dense_traffic_settings, predict, read_scenes, track
 from .track_filters import MOVING, Kinematics, TurnRate
 from .track_table import SensorEvidence, TrackTable
 from .tracker import Tracker
@@ -29,7 +28,6 @@ from .update import visible_share
 
 __all__ = [
     "MOVING",
-    "UNKNOWN_SENSORS",
     "AssociationCost",
     "AssociationName",
     "AssociationProblem",
@@ -61,13 +59,13 @@ __all__ = [
     "TrafficSettings",
     "TurnRate",
     "TypicalSize",
-    "check_scenes",
     "dense_traffic_settings",
     "estimator_parameters",
     "frame_measurements",
     "motion_of",
     "of_scene",
     "predict",
+    "read_scenes",
     "scaled_sensors",
     "track",
     "visible_share",

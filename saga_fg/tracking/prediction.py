@@ -24,6 +24,8 @@ detections (`saga_fg.tracking.track_life`), which soon are the smaller part.
 
 import logging
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -32,11 +34,11 @@ from saga_fg.model import Curvilinear, KnownCourses, NodeTable, Paths, Unseen, b
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, of_classes, unchecked, wrap_angle
 from saga_fg.tracking.edge_record import answers
 from saga_fg.tracking.right_of_way import INTERVAL
-from saga_fg.tracking.track_filters import MOVING, TURNING
+from saga_fg.tracking.track_filters import MOVING, TURNING, Kinematics
 from saga_fg.tracking.track_life import reported_rows, untrackable
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.traffic import STEP, paths
-from saga_fg.types import VEHICLES, PredictedTracks
+from saga_fg.types import VEHICLES, PredictedMode, PredictedTracks
 
 ACROSS = 0.3  # m/s, deviation of the velocity of a vehicle across its path: it moves within its lane
 LEAVING = 1.0  # m/s, where no earlier traffic tells the path: it may turn, or leave its lane
@@ -254,33 +256,48 @@ def look_ahead(state: TrackerState, horizons: FloatArray, joint: bool = False) -
     Left out are tracks that can't be predicted to the last of them. joint: with their joint covariances.
     """
     newest, reported = state.clock.newest, state.table.id[reported_rows(state)]
-    tables, moments, together = [], [], []
+    tables, expected, moving, together = [], [], [], []
     for horizon in horizons.tolist():
         _predict_to(state, state.relative(newest) + horizon)
         rows = np.flatnonzero(np.isin(state.table.id, reported))
         tables.append(state.table.select(rows))
-        moments.append(state.reported_kinematics().select(rows))
-        together.append(_joint_covariance(state, rows, moments[-1].P) if joint else np.empty((0, 0)))
+        expected.append(state.reported_kinematics(rows))
+        moving.append(state.kinematics().select(rows))
+        together.append(_joint_covariance(state, rows, expected[-1].P) if joint else np.empty((0, 0)))
     last = tables[-1]
     kept = [np.flatnonzero(np.isin(table.id, last.id)) for table in tables]
-    moved = [now.select(rows) for now, rows in zip(moments, kept, strict=True)]
-    position, velocity, P, P_velocity = (np.stack(columns) for columns in zip(*moved, strict=True))
     yaw = np.stack([table.box.yaw[k] for table, k in zip(tables, kept, strict=True)])
     of_pairs = [(2 * k[:, None] + [0, 1]).ravel() for k in kept]  # the coordinates of the tracks kept
     whole = np.stack([P[np.ix_(k, k)] for P, k in zip(together, of_pairs, strict=True)]) if joint else None
-    place = position + state.origin
+    still = [table.stationarity.select(k) for table, k in zip(tables, kept, strict=True)]
+    none = np.zeros((len(last), 2)), np.zeros((len(last), 2, 2))
+    standing = [Kinematics(one.position, none[0], one.P, none[1]) for one in still]
+    stands = np.stack([one.probability for one in still]) * (state.settings.stationary_share > 0)
+    moves = [now.select(rows) for now, rows in zip(moving, kept, strict=True)]
     return PredictedTracks(
-        timestamp=newest,
-        horizons=horizons,
-        id=last.id,
-        label=last.label,
-        position=place,
-        velocity=velocity,
+        newest,
+        horizons,
+        last.id,
+        last.label,
         yaw=yaw,
-        position_covariance=P,
-        velocity_covariance=P_velocity,
+        **_moments(state, [now.select(rows) for now, rows in zip(expected, kept, strict=True)]),
+        modes=(
+            PredictedMode("moving", 1 - stands, **_moments(state, moves)),
+            PredictedMode("stationary", stands, **_moments(state, standing)),
+        ),
         joint_covariance=whole,
     )
+
+
+def _moments(state: TrackerState, each: Sequence[Kinematics]) -> dict[str, Any]:
+    """Columns (H, N, ...) of what is predicted in the world, by the kinematics of N tracks at each of H horizons."""
+    position, velocity, P, P_velocity = (np.stack(columns) for columns in zip(*each, strict=True))
+    return {
+        "position": position + state.origin,
+        "velocity": velocity,
+        "position_covariance": P,
+        "velocity_covariance": P_velocity,
+    }
 
 
 def _predict_to(state: TrackerState, time: float) -> None:

@@ -1,4 +1,4 @@
-"""Tracking of a whole table of detections in one call, which refuses one whose contents contradict how it is read.
+"""Tracking and prediction of a whole table of detections in one call; one that contradicts how it is read is refused.
 
 `dense_traffic_settings` are those for a sensor that stands or hovers over a road. Drones and roadside sensors give
 vehicles with headings, many at a time and often. There a vehicle keeps to its course, to the trails of those before it,
@@ -11,11 +11,13 @@ two recorded roads, and confirmed on the others.
 
 import copy
 import warnings
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Mapping
 from functools import cache
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from saga_fg.errors import InputError
 from saga_fg.model import (
@@ -33,7 +35,6 @@ from saga_fg.model import (
 )
 from saga_fg.numerics import IntArray, checked
 from saga_fg.tables import (
-    RawTable,
     Table,
     TableImport,
     idle_rules,
@@ -46,7 +47,16 @@ from saga_fg.tables import (
 from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
 from saga_fg.tracking.tracker import Tracker
 from saga_fg.tracking.traffic import TrafficSettings
-from saga_fg.types import DEFAULT, Detections, Frame, Scene, SignalSettings, Tracks
+from saga_fg.types import (
+    DEFAULT,
+    Detections,
+    Frame,
+    PredictedTracks,
+    Scene,
+    SignalSettings,
+    Tracks,
+    checked_horizons,
+)
 
 
 @cache
@@ -131,41 +141,101 @@ def track(
     whose contents contradict how it is read: units of angles, times, lengths or speeds, coordinates, exchanged columns.
     """
     how = TableImport(columns or {}, classes or {}, units or {}, coordinates, as_given=as_given)
-    sensors = UNKNOWN_SENSORS if sensors is None else sensors
+    found = read_scenes(detections, how, settings, sensors)
+    parts = []
+    for scene in found.scenes:
+        tracker = found.new_tracker()
+        parts += [found.named(scene, tracker.step(frame).table_columns()) for frame in scene.frames]
+    return table_like(detections, parts or [Tracks.empty(0.0).table_columns()])
+
+
+HORIZONS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
+
+
+def predict(
+    detections: Table,
+    horizons: ArrayLike = HORIZONS,
+    times: ArrayLike | None = None,
+    modes: bool = False,
+    settings: TrackerSettings | None = None,
+    sensors: Mapping[str, Sensor] | None = None,
+    columns: Mapping[str, str] | None = None,
+    classes: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    coordinates: Literal["", "world", "ego", "sensor", "camera"] = "",
+    as_given: bool = False,
+) -> Table:
+    """Predict where all tracks of a table of detections will be, and return a table: a row for each track and horizon.
+
+    detections  and the arguments from settings on as of `track`, with the same tracks
+    horizons    (H,) s, increasing, from 0 to 60
+    times       (T,) from which to predict, s as in the table of tracks, in any order; the last frame of each scene if
+                left out. Nothing that comes after a time has an influence on what is predicted from it.
+    modes       a row for each mode (moving, stationary), with `probability`; otherwise their mean and covariance
+
+    The table is of the same kind, with the columns of `PredictedTracks.table_columns`, and `scene` if the detections
+    have one. Warns and raises as `track`, and for a time that is in no scene.
+    """
+    how = TableImport(columns or {}, classes or {}, units or {}, coordinates, as_given=as_given)
+    ahead, wanted = checked_horizons(horizons), None if times is None else np.sort(checked("times", times, (None,)))
+    found = read_scenes(detections, how, settings, sensors)
+    spans = [(scene.frames[0].timestamp, scene.frames[-1].timestamp) for scene in found.scenes]
+    for time in [] if wanted is None else wanted.tolist():
+        if not any(first <= time <= last for first, last in spans):
+            within = ", ".join(f"{first:.10g} to {last:.10g}" for first, last in spans[:6])
+            raise InputError(f"times: expected seconds within a scene ({within}), got {time:.10g}")
+    parts = []
+    for scene, (first, last) in zip(found.scenes, spans, strict=True):
+        tracker, frames = found.new_tracker(), deque(scene.frames)
+        here = np.array([last]) if wanted is None else wanted[(wanted >= first) & (wanted <= last)]
+        for time in here.tolist():
+            while frames and frames[0].timestamp <= time:
+                tracker.step(frames.popleft())
+            parts.append(found.named(scene, tracker.predict(ahead, since=time).table_columns(modes)))
+    return table_like(detections, parts or [PredictedTracks.empty(0.0, ahead).table_columns(modes)])
+
+
+class TableScenes(NamedTuple):
+    """The scenes of a table of detections, and how to track them; named: they have a column `scene`."""
+
+    scenes: list[Scene]
+    settings: TrackerSettings
+    sensors: Mapping[str, Sensor]
+    is_named: bool
+
+    def new_tracker(self) -> Tracker:
+        """Return a tracker for one of them."""
+        return Tracker(self.settings, self.sensors)
+
+    def named(self, scene: Scene, columns: Mapping[str, Any]) -> dict[str, Any]:
+        """Columns of a table about a scene, with its name where scenes have one."""
+        name = {"scene": np.full(len(columns["id"]), scene.name)} if self.is_named else {}
+        return name | dict(columns)
+
+
+def read_scenes(
+    detections: Table, how: TableImport, settings: TrackerSettings | None, sensors: Mapping[str, Sensor] | None
+) -> TableScenes:
+    """Read a table. Settings that are left out are those that fit what the first scene looks like.
+
+    Warns of those for dense traffic and of what is doubtful, at the caller's caller; raises as `tell`.
+    """
     raw = raw_table(detections, how)
     scenes = scenes_of(raw)
+    why = seems_dense_traffic(scenes[0].frames) if scenes and settings is None else ""
+    if why:
+        plain = "settings=TrackerSettings(min_hits=2) takes the plain ones"
+        warnings.warn(f"settings for dense traffic: {why}; {plain}", stacklevel=3)
     if settings is None:
-        settings = fitting_settings(scenes)
-    check_scenes(raw, scenes, settings, sensors)
-    found = []
-    for scene in scenes:
-        tracker = Tracker(settings, sensors)
-        for frame in scene.frames:
-            tracks = tracker.step(frame).table_columns()
-            name = {"scene": np.full(len(tracks["id"]), scene.name)} if "scene" in raw.columns else {}
-            found.append({**name, **tracks})
-    return table_like(detections, found or [Tracks.empty(0.0).table_columns()])
-
-
-def fitting_settings(scenes: Sequence[Scene]) -> TrackerSettings:
-    """Settings for scenes of which nothing is known, by what the first looks like; warns of those for dense traffic."""
-    why = seems_dense_traffic(scenes[0].frames) if scenes else ""
-    if not why:
-        return TrackerSettings(min_hits=2)
-    warnings.warn(
-        f"settings for dense traffic: {why}; settings=TrackerSettings(min_hits=2) takes the plain ones", stacklevel=3
-    )
-    return dense_traffic_settings()
-
-
-def check_scenes(raw: RawTable, scenes: list[Scene], settings: TrackerSettings, sensors: Mapping[str, Sensor]) -> None:
-    """Warn of what is doubtful in the scenes of a table, at the caller's caller; raise as `tell`."""
+        settings = dense_traffic_settings() if why else TrackerSettings(min_hits=2)
+    sensors = UNKNOWN_SENSORS if sensors is None else sensors
     frames = [frame for scene in scenes for frame in scene.frames]
     labels = {name for frame in frames for name in frame.detections.boxes.label.tolist()}
     logits = any(sensor_model(sensors, name).score == "logit" for name in {frame.sensor for frame in frames})
-    found = [one for scene in scenes for one in scene.findings or () if one.kind != "scores" or not logits]
+    findings = [one for scene in scenes for one in scene.findings or () if one.kind != "scores" or not logits]
     rules = idle_rules(acting_classes(settings.edges), labels - {UNNAMED})
-    tell([*found, *([] if rules is None else [rules])], raw, depth=4)
+    tell([*findings, *([] if rules is None else [rules])], raw, depth=4)
+    return TableScenes(scenes, settings, sensors, "scene" in raw.columns)
 
 
 D = TypeVar("D")

@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from traceback import walk_tb
 from typing import Any
 
@@ -248,19 +248,22 @@ class Tracker:
         predict(ahead, ahead.relative(min(timestamp, newest + LATEST)))
         return report_tracks(ahead, timestamp)
 
-    def predict(self, horizons: ArrayLike, joint: bool = False) -> PredictedTracks:
+    def predict(self, horizons: ArrayLike, joint: bool = False, since: float | None = None) -> PredictedTracks:
         """The tracks reported now at future times, with the edges of the graph that go on to act.
 
-        horizons  (H,) s from the newest frame on, increasing, from 0 to 60
+        horizons  (H,) s, increasing, from 0 to 60
         joint     with the joint covariance of all positions at each of these times
+        since     timestamp from which the horizons count, s; the newest frame's if left out
 
         Nothing is taken in or changed. Left out are tracks that can't be predicted that far. Raises `InputError` for
-        other horizons, and before the first frame.
+        other horizons, also as counted from the newest frame, and before the first frame.
         """
-        checked = checked_horizons(horizons)
-        if self._state.clock.newest == -math.inf:
+        checked, newest = checked_horizons(horizons), self._state.clock.newest
+        if newest == -math.inf:
             raise InputError("predict: expected a frame before, there is no time to predict from")
-        return look_ahead(self._state.copied(), checked, joint)
+        since = newest if since is None else finite_seconds(since)
+        found = look_ahead(self._state.copied(), checked_horizons(checked + (since - newest)), joint)
+        return replace(found, timestamp=since, horizons=checked)
 
     def snapshot(self) -> TrackerSnapshot:
         """Everything that the tracker knows, as a value."""

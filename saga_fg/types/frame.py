@@ -33,7 +33,7 @@ from saga_fg.numerics import (
 )
 from saga_fg.types.boxes import MAX_POSITION, MAX_SPEED, Boxes
 from saga_fg.types.road_map import RoadMap
-from saga_fg.types.track import html_table, text_table
+from saga_fg.types.track import ShownTable
 
 if TYPE_CHECKING:  # frames bring observations of landmarks, and are read before anything is estimated
     import gtsam
@@ -259,7 +259,7 @@ class Detection:
 
 
 @dataclass(frozen=True, eq=False)
-class Detections(Columns):
+class Detections(Columns, ShownTable):
     """N detections: `boxes`, `score` (N,), `range_rate` (N,), `position_covariance` (N, 2, 2), `identity` (N,).
 
     Iterating gives `Detection`s.
@@ -340,23 +340,12 @@ class Detections(Columns):
     def __iter__(self) -> Iterator[Detection]:
         return (self[row] for row in range(len(self)))
 
-    def __str__(self) -> str:
-        return text_table(*self._shown())
-
-    def _repr_html_(self) -> str:
-        return html_table(*self._shown())
-
-    def _shown(self) -> tuple[str, tuple[str, ...], list[tuple[str | float, ...]]]:
-        columns = (
-            self.boxes.label,
-            *self.boxes.position[:, :2].T,
-            *self.boxes.size[:, :2].T,
-            self.boxes.yaw,
-            self.score,
-        )
-        rows = list(zip(*(column.tolist() for column in columns), strict=True))
-        names = ("class", "x, m", "y, m", "length, m", "width, m", "yaw, rad", "score")
-        return f"{len(self)} detections", names, rows
+    def _shown(self) -> tuple[str, Mapping[str, Any]]:
+        boxes = self.boxes
+        place = {"x, m": boxes.position[:, 0], "y, m": boxes.position[:, 1]}
+        size = {"length, m": boxes.size[:, 0], "width, m": boxes.size[:, 1]}
+        columns = {"class": boxes.label, **place, **size, "yaw, rad": boxes.yaw, "score": self.score}
+        return f"{len(self)} detections", columns
 
     def transformed(self, target_T_source: FloatArray) -> Self:
         """The detections in target coordinates."""

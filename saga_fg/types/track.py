@@ -1,9 +1,11 @@
 """Tracker output: `Tracks` of one moment, `PredictedTracks` at future times, and both as tables to show."""
 
+from __future__ import annotations
+
 import html
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -48,6 +50,24 @@ def _text(value: str | float | int) -> str:
     if isinstance(value, float):
         return f"{value:.2f}" if value == value else ""
     return str(value)
+
+
+class ShownTable:
+    """A table that shows its first rows in a terminal and a notebook."""
+
+    def _shown(self) -> tuple[str, Mapping[str, Any]]:
+        """A title, and arrays (N,) by the heading of their column."""
+        raise NotImplementedError
+
+    def _shown_rows(self) -> tuple[str, list[str], list[tuple[str | float | int, ...]]]:
+        title, columns = self._shown()
+        return title, list(columns), list(zip(*(column.tolist() for column in columns.values()), strict=True))
+
+    def __str__(self) -> str:
+        return text_table(*self._shown_rows())
+
+    def _repr_html_(self) -> str:
+        return html_table(*self._shown_rows())
 
 
 def data_frame(columns: Mapping[str, Any]) -> Any:
@@ -128,7 +148,7 @@ class Yields:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracks(Columns):
+class Tracks(Columns, ShownTable):
     """All tracks of one moment, as columns, in world coordinates.
 
     timestamp            s
@@ -218,48 +238,68 @@ class Tracks(Columns):
 
         Covariances of the horizontal position are cov_xx, cov_xy, cov_yy, of the velocity cov_vxvx and so on.
         """
-        vectors: tuple[tuple[tuple[str, ...], FloatArray], ...] = (
+        vectors: tuple[Vectors, ...] = (
             (("x", "y", "z"), self.boxes.position),
             (("length", "width", "height"), self.boxes.size),
             (("yaw",), self.boxes.yaw[:, None]),
             (("vx", "vy"), self.boxes.velocity),
             (("score",), self.score[:, None]),
-            (("cov_xx", "cov_xy", "cov_yy"), upper_triangle(self.position_covariance)),
-            (("cov_vxvx", "cov_vxvy", "cov_vyvy"), upper_triangle(self.velocity_covariance)),
+            (POSITION_COVARIANCE, upper_triangle(self.position_covariance)),
+            (VELOCITY_COVARIANCE, upper_triangle(self.velocity_covariance)),
             (("coasting",), self.coasting[:, None]),
         )
         first = {"timestamp": np.full(len(self), self.timestamp), "id": self.id, "label": self.boxes.label}
-        numbers = {name: values[:, k] for names, values in vectors for k, name in enumerate(names)}
-        return first | numbers | {"settled": self.settled}
+        return first | _components(vectors) | {"settled": self.settled}
 
-    def __str__(self) -> str:
-        return text_table(*self._shown())
+    def _shown(self) -> tuple[str, Mapping[str, Any]]:
+        shown = _placed(self.boxes.position, self.boxes.velocity, self.position_covariance)
+        last = {"score": self.score, "unseen for, s": self.coasting}
+        title = f"{len(self)} tracks at {self.timestamp:.3f} s"
+        return title, {"id": self.id, "class": self.boxes.label, **shown, **last}
 
-    def _repr_html_(self) -> str:
-        return html_table(*self._shown())
 
-    def _shown(self) -> tuple[str, tuple[str, ...], list[tuple[str | float | int, ...]]]:
-        deviation = np.sqrt(np.trace(self.position_covariance, axis1=1, axis2=2) / 2)
-        speed = np.linalg.norm(self.boxes.velocity, axis=1)
-        columns = (
-            self.id,
-            self.boxes.label,
-            *self.boxes.position[:, :2].T,
-            deviation,
-            speed,
-            self.score,
-            self.coasting,
-        )
-        rows = list(zip(*(column.tolist() for column in columns), strict=True))
-        names = ("id", "class", "x, m", "y, m", "position ±, m", "speed, m/s", "score", "unseen for, s")
-        return f"{len(self)} tracks at {self.timestamp:.3f} s", names, rows
+Vectors = tuple[tuple[str, ...], FloatArray]
+"""Names of components, and the vectors (N, n) of these."""
+
+POSITION_COVARIANCE = ("cov_xx", "cov_xy", "cov_yy")
+VELOCITY_COVARIANCE = ("cov_vxvx", "cov_vxvy", "cov_vyvy")
+
+
+def _components(vectors: Sequence[Vectors]) -> dict[str, FloatArray]:
+    return {name: values[:, k] for names, values in vectors for k, name in enumerate(names)}
+
+
+def _placed(position: FloatArray, velocity: FloatArray, covariance: FloatArray) -> dict[str, FloatArray]:
+    """Columns that show positions (n, 2 or 3), velocities (n, 2) and the covariance (n, 2, 2) of positions."""
+    deviation = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2)
+    speed = np.linalg.norm(velocity, axis=1)
+    return {"x, m": position[:, 0], "y, m": position[:, 1], "position ±, m": deviation, "speed, m/s": speed}
 
 
 LONGEST_PREDICTION = 60.0  # s; nobody knows where traffic is a minute later, and time runs out before
 
 
 @dataclass(frozen=True, eq=False)
-class PredictedTracks:
+class PredictedMode:
+    """How N tracks go on in one of two cases: they move, or stand where they were last.
+
+    probability  (H, N)  of this case at each horizon; the other columns are as in `PredictedTracks`, given the case
+    """
+
+    name: Literal["moving", "stationary"]
+    probability: FloatArray
+    position: FloatArray
+    velocity: FloatArray
+    position_covariance: FloatArray
+    velocity_covariance: FloatArray
+
+
+LEAST_MODE = 1e-3
+"""Probability below which a mode is left out of tables."""
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedTracks(ShownTable):
     """The N tracks of one moment at H future times, in world coordinates.
 
     timestamp            s, of the moment from which they are predicted
@@ -270,6 +310,7 @@ class PredictedTracks:
     yaw                  (H, N)        heading, rad; NaN where it is unknown
     position_covariance  (H, N, 2, 2)  m^2
     velocity_covariance  (H, N, 2, 2)  (m/s)^2
+    modes                              moving and stationary, of which mean and covariance are the mixture's
     joint_covariance     (H, 2N, 2N)   of all positions (x_1, y_1, x_2, ...), m^2; None unless it was asked for
     """
 
@@ -282,7 +323,16 @@ class PredictedTracks:
     yaw: FloatArray
     position_covariance: FloatArray
     velocity_covariance: FloatArray
+    modes: tuple[PredictedMode, ...]
     joint_covariance: FloatArray | None = None
+
+    @classmethod
+    def empty(cls, timestamp: float, horizons: FloatArray) -> Self:
+        h = len(horizons)
+        none, vectors, matrices = np.empty((h, 0)), np.empty((h, 0, 2)), np.empty((h, 0, 2, 2))
+        ids, label = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.str_)
+        modes = (PredictedMode("moving", none, vectors, vectors, matrices, matrices),)
+        return cls(timestamp, horizons, ids, label, vectors, vectors, none, matrices, matrices, modes)
 
     def __len__(self) -> int:
         return len(self.id)
@@ -291,6 +341,49 @@ class PredictedTracks:
     def times(self) -> FloatArray:
         """(H,) timestamps of the predictions, s."""
         return np.asarray(self.timestamp + self.horizons)
+
+    def to_pandas(self) -> Any:
+        """Return a `pandas.DataFrame` of `table_columns`. Raises `MissingExtraError` without pandas."""
+        return data_frame(self.table_columns())
+
+    def table_columns(self, modes: bool = False) -> dict[str, Any]:
+        """Return the columns of a table, a row for each horizon and track, named as in the files of `--predict`.
+
+        modes: a row for each mode, with its name and probability, in place of their mean and covariance
+        """
+        if not modes:
+            return self._names() | self._moments(self)
+        parts = [
+            self._names()
+            | {"mode": np.full(mode.probability.size, mode.name), "probability": mode.probability.ravel()}
+            | self._moments(mode)
+            for mode in self.modes
+        ]
+        whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        order = np.arange(len(whole["id"])).reshape(len(parts), -1).T.ravel()  # the modes of a track together
+        order = order[whole["probability"][order] >= LEAST_MODE]
+        return {name: column[order] for name, column in whole.items()}
+
+    def _names(self) -> dict[str, Any]:
+        h, n = len(self.horizons), len(self)
+        times = {"timestamp": np.full(h * n, self.timestamp), "horizon": np.repeat(self.horizons, n)}
+        return times | {"id": np.tile(self.id, h), "label": np.tile(self.label, h)}
+
+    def _moments(self, of: PredictedTracks | PredictedMode) -> dict[str, FloatArray]:
+        vectors: tuple[Vectors, ...] = (
+            (("x", "y"), of.position.reshape(-1, 2)),
+            (("yaw",), self.yaw.reshape(-1, 1)),
+            (("vx", "vy"), of.velocity.reshape(-1, 2)),
+            (POSITION_COVARIANCE, upper_triangle(of.position_covariance.reshape(-1, 2, 2))),
+            (VELOCITY_COVARIANCE, upper_triangle(of.velocity_covariance.reshape(-1, 2, 2))),
+        )
+        return _components(vectors)
+
+    def _shown(self) -> tuple[str, Mapping[str, Any]]:
+        names = self._names()
+        rows = self.position.reshape(-1, 2), self.velocity.reshape(-1, 2), self.position_covariance.reshape(-1, 2, 2)
+        first = {"id": names["id"], "class": names["label"], "after, s": names["horizon"]}
+        return f"{len(self)} tracks, predicted from {self.timestamp:.3f} s", {**first, **_placed(*rows)}
 
 
 def checked_horizons(horizons: ArrayLike) -> FloatArray:

@@ -55,7 +55,16 @@ from saga_fg.tables import (
     box_columns,
     findings_of,
 )
-from saga_fg.types import Boxes, Finding, PredictedTracks, Scene, Tracks, refuse_contradictions
+from saga_fg.types import (
+    POSITION_COVARIANCE,
+    VELOCITY_COVARIANCE,
+    Boxes,
+    Finding,
+    PredictedTracks,
+    Scene,
+    Tracks,
+    refuse_contradictions,
+)
 
 if TYPE_CHECKING:
     from saga_fg.smoothing import Labels, Review
@@ -287,8 +296,8 @@ def track_rows(raw: RawTable, tell: Callable[[Sequence[Finding], RawTable], None
         id=raw.identities("id")[kept],
         boxes=found.boxes.select(kept),
         score=found.score[kept],
-        position_covariance=_covariance(raw, ("cov_xx", "cov_xy", "cov_yy"))[kept],
-        velocity_covariance=_covariance(raw, ("cov_vxvx", "cov_vxvy", "cov_vyvy"))[kept],
+        position_covariance=_covariance(raw, POSITION_COVARIANCE)[kept],
+        velocity_covariance=_covariance(raw, VELOCITY_COVARIANCE)[kept],
         coasting=raw.numbers("coasting")[kept],
         yaw_variance=raw.numbers("yaw_variance")[kept],
         source=raw.texts("source", "observed")[kept],
@@ -302,12 +311,7 @@ def _covariance(raw: RawTable, names: tuple[str, str, str]) -> FloatArray:
     return from_upper_triangle(np.stack([raw.numbers(name) for name in names], axis=-1))
 
 
-_NAMES = ("scene", "timestamp", "horizon", "id", "label")
-_POSITION_COVARIANCE = ("cov_xx", "cov_xy", "cov_yy")
-PREDICTION_COLUMNS = (
-    *(*_NAMES, "x", "y", "yaw", "vx", "vy", *_POSITION_COVARIANCE),
-    *("cov_vxvx", "cov_vxvy", "cov_vyvy"),
-)
+PREDICTION_COLUMNS = ("scene", *PredictedTracks.empty(0.0, np.zeros(1)).table_columns())
 SUFFIX = ".predictions.csv"
 
 
@@ -358,17 +362,11 @@ def prediction_writer(path: Path) -> Iterator[Callable[[str, Sequence[PredictedT
 
 
 def _prediction_rows(scene: str, predicted: PredictedTracks) -> Iterator[list[Any]]:
-    names = list(zip(predicted.id.tolist(), predicted.label.tolist(), strict=True))
-    for k, horizon in enumerate(predicted.horizons.tolist()):
-        covariances = (predicted.position_covariance[k], predicted.velocity_covariance[k])
-        numbers = np.column_stack(
-            [
-                *(predicted.position[k], predicted.yaw[k], predicted.velocity[k]),
-                *(upper_triangle(P) for P in covariances),
-            ]
-        )
-        for (id_, label), row in zip(names, numbers.tolist(), strict=True):
-            yield [scene, predicted.timestamp, horizon, id_, label, *(None if x != x else round(x, 4) for x in row)]
+    columns = predicted.table_columns()
+    exact = [columns.pop(name).tolist() for name in ("timestamp", "horizon", "id", "label")]
+    numbers = np.column_stack(list(columns.values())).tolist()
+    for *names, row in zip(*exact, numbers, strict=True):
+        yield [scene, *names, *(None if x != x else round(x, 4) for x in row)]
 
 
 def predictions_path(result: Path) -> Path:
@@ -395,7 +393,7 @@ def read_predictions(result: Path) -> dict[str, PredictionRows]:
 def _read_table(path: Path) -> dict[str, PredictionRows]:
     numbers = ("timestamp", "horizon", "id", "x", "y")
     raw = read_raw_table(path, Layout(PREDICTION_COLUMNS, numbers))
-    columns = {name: raw.numbers(name) for name in (*numbers, *_POSITION_COVARIANCE)}
+    columns = {name: raw.numbers(name) for name in numbers}
     for name in numbers:
         if np.isnan(columns[name]).any():
             raise raw.fault(int(np.argmax(np.isnan(columns[name]))), f"{name}: expected a number, got none")
@@ -408,7 +406,7 @@ def _read_table(path: Path) -> dict[str, PredictionRows]:
         columns["horizon"],
         columns["id"].astype(np.int64).astype(np.str_),
         np.stack([columns["x"], columns["y"]], axis=-1),
-        from_upper_triangle(np.stack([columns[name] for name in _POSITION_COVARIANCE], axis=-1)),
+        _covariance(raw, POSITION_COVARIANCE),
     )
     scene = raw.texts("scene", Path(path.name.removesuffix(SUFFIX)).stem)
     return {str(name): rows.select(np.flatnonzero(scene == name)) for name in np.unique(scene)}
