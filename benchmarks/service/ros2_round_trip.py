@@ -20,7 +20,8 @@ from benchmarks.service.served import CirclingObjects
 from data_tools.datasets.mcap.objects import AUTOWARE_CLASSES, pose, vector
 from data_tools.datasets.mcap.recording import LoggedMessage
 from data_tools.datasets.mcap.ros2_types import Columns, encoded, header
-from pipelines.serving.ros2 import Ros2Network, payload_decoder
+from pipelines.serving.ros2 import payload_decoder
+from pipelines.serving.ros2_dds import DdsNetwork
 from saga_fg.errors import SagaError
 
 INTERVAL = 0.1  # s between frames
@@ -67,7 +68,7 @@ class Peer:
 
     def __init__(self, objects: int, seed: int) -> None:
         self._scene, self._rng = CirclingObjects(objects, seed), np.random.default_rng([seed, 5])
-        self._network = Ros2Network({"/tracks": (TRACKED,)})
+        self._network = DdsNetwork({"/tracks": (TRACKED,)})
         self._transform = self._network.publisher("/tf", "tf2_msgs/TFMessage")
         self._detected = self._network.publisher("/detections", DETECTED)
         self.sent: dict[int, float] = {}  # by stamp, ns

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -170,13 +170,21 @@ def _serve_ros2(
             "--odometry", help="Topic of nav_msgs/Odometry for the pose, beside /tf and /tf_static.", metavar="TOPIC"
         ),
     ] = None,
+    middleware: Annotated[
+        Literal["rclpy", "cyclonedds"] | None,
+        typer.Option(
+            "--middleware",
+            help="rclpy: a node of the ROS 2 that is installed; cyclonedds: DDS without ROS.  [default: rclpy if it is "
+            "installed]",
+        ),
+    ] = None,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
-    """Track live as a node of ROS 2, over DDS: topics of detections in, tracks out. Needs [ros2], no ROS.
+    """Track live as a node of ROS 2: topics of detections in, tracks out. Needs [ros2], no ROS.
 
-    The domain is that of ROS_DOMAIN_ID, network interfaces are those of CYCLONEDDS_URI. Types and quality of service
-    of the detections are those of their publishers. `saga-fg docs guides/ros2` has an example.
+    The domain is that of ROS_DOMAIN_ID; without ROS, network interfaces are those of CYCLONEDDS_URI. Types and quality
+    of service of the detections are those of their publishers. `saga-fg docs guides/ros2` has an example.
 
     SIGTERM and Ctrl-C finish what has come in; the exit code is then 143 or 0.
 
@@ -194,7 +202,7 @@ def _serve_ros2(
     results = result_topics(tracks)
 
     def run(stream: StreamTracker[Any], ready: Ready, stop: StopRequest) -> None:
-        node = Ros2Node(stream, options, results)
+        node = Ros2Node(stream, options, results, middleware)
         ready(node.about)
         node.run(stop)
 

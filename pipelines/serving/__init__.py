@@ -3,7 +3,8 @@
     line -> message -> numbering -> reordering -> tracker -> answer
 
 `StreamTracker` answers lines; `serve_pipe` takes them from standard input, `SocketServer` from a TCP or Unix socket;
-`StateKeeper` keeps the state in a file. `ros2.Ros2Node` gives frames of ROS 2's messages to the same stream.
+`StateKeeper` keeps the state in a file. `ros2.Ros2Node` gives frames of ROS 2's messages to the same stream, over a
+`Ros2Network`: DDS without ROS, or rclpy.
 """
 
 from pipelines.serving.messages import StreamClient

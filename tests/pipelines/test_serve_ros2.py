@@ -7,6 +7,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections import deque
+from importlib.machinery import ModuleSpec
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,7 +22,8 @@ from data_tools.datasets.mcap.objects import autoware_rows, message_objects
 from data_tools.datasets.mcap.recording import LoggedMessage, Topic
 from pipelines.config import load_config
 from pipelines.serving import StreamSettings, StreamTracker
-from pipelines.serving.ros2 import Ros2Network, Ros2Node, payload_decoder, result_topics, shown_tracks, structure
+from pipelines.serving.ros2 import Ros2Node, open_network, payload_decoder, result_topics, shown_tracks
+from pipelines.serving.ros2_dds import DdsNetwork, structure
 from saga_fg import InputError
 from saga_fg.errors import MissingExtraError
 from tests.data_tools import mcap_example as example
@@ -86,7 +90,7 @@ def test_types_and_qualities_of_publishers_are_found_and_other_types_are_named(t
     from cyclonedds.topic import Topic
 
     odometry = "nav_msgs/Odometry"
-    network = Ros2Network({"/odom": (odometry,), "/objects": (DETECTED,)})
+    network = DdsNetwork({"/odom": (odometry,), "/objects": (DETECTED,)})
     participant = DomainParticipant(DOMAIN)
     kind, header = structure.__wrapped__(odometry), structure.__wrapped__("std_msgs/Header")
     writer = DataWriter(participant, Topic(participant, "rt/odom", kind), Qos(Policy.Reliability.BestEffort))
@@ -127,7 +131,7 @@ class Published:
         def publisher(network, topic, type_):
             return lambda data: self.sent.append((topic, type_, payload_decoder(type_)(data)))
 
-        monkeypatch.setattr(Ros2Network, "publisher", publisher)
+        monkeypatch.setattr(DdsNetwork, "publisher", publisher)
         config = load_config("file")
         self.stream = StreamTracker(lambda: config.new_tracker("saga"), settings, shown=shown_tracks)
         topics = {"lidar": "/objects"}
@@ -252,6 +256,151 @@ def test_names_that_are_no_topics(monkeypatch):
 
 def test_without_the_extra_it_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "cyclonedds.builtin", None)
-    monkeypatch.delitem(sys.modules, "pipelines.serving.ros2")
+    monkeypatch.delitem(sys.modules, "pipelines.serving.ros2_dds")
     with pytest.raises(MissingExtraError, match=r"pip install 'saga-fg\[ros2\]'"):
-        importlib.import_module("pipelines.serving.ros2")
+        importlib.import_module("pipelines.serving.ros2_dds")
+
+
+class FakeRos:
+    """What `pipelines.serving.ros2_rclpy` uses of rclpy and rosidl_runtime_py, in one process; it passes bytes."""
+
+    def __init__(self, monkeypatch):
+        self.published, self.subscriptions, self.publishers, self.running = [], {}, {}, None
+        policies = SimpleNamespace(RELIABLE="reliable", BEST_EFFORT="best effort")
+        durabilities = SimpleNamespace(TRANSIENT_LOCAL="transient", VOLATILE="volatile")
+        modules = {
+            "rclpy": {"init": self.init, "create_node": lambda name, context: self},
+            "rclpy.context": {"Context": lambda: SimpleNamespace(try_shutdown=lambda: None)},
+            "rclpy.executors": {"SingleThreadedExecutor": lambda context: self},
+            "rclpy.qos": {
+                "QoSProfile": SimpleNamespace,
+                "ReliabilityPolicy": policies,
+                "DurabilityPolicy": durabilities,
+            },
+            "rosidl_runtime_py": {},
+            "rosidl_runtime_py.utilities": {"get_message": self.get_message},
+        }
+        for name, content in modules.items():
+            module = ModuleType(name)
+            vars(module).update(content)
+            module.__spec__ = ModuleSpec(name, None)
+            monkeypatch.setitem(sys.modules, name, module)
+        monkeypatch.setitem(sys.modules, "pipelines.serving.ros2_rclpy", None)
+        del sys.modules["pipelines.serving.ros2_rclpy"]  # imported anew here, and gone after the test
+        self.waiting = deque()
+
+    def init(self, context):
+        self.running = context
+
+    @staticmethod
+    def get_message(name):
+        package, _, message = name.split("/")
+        if package == "nav_msgs":
+            raise ModuleNotFoundError("No module named 'nav_msgs'")
+        return f"{package}.msg.{message}"
+
+    def add_node(self, node):
+        assert node is self
+
+    def spin_once(self, timeout_sec):
+        if self.waiting:
+            callback, data = self.waiting.popleft()
+            callback(data)
+
+    def offer(self, topic, type_, reliability="reliable"):
+        found = SimpleNamespace(
+            topic_type=type_,
+            endpoint_gid=[len(self.publishers.get(topic, []))],
+            qos_profile=SimpleNamespace(reliability=reliability),
+        )
+        self.publishers.setdefault(topic, []).append(found)
+
+    def get_publishers_info_by_topic(self, topic):
+        return self.publishers.get(topic, [])
+
+    def create_subscription(self, kind, topic, callback, quality, raw):
+        assert raw
+        self.subscriptions[topic] = (kind, quality, callback)
+
+    def create_publisher(self, kind, topic, quality):
+        assert quality.reliability == "reliable"
+
+        def publish(data):
+            assert type(data) is bytes
+            self.published.append((topic, kind, data))
+
+        return SimpleNamespace(publish=publish)
+
+    def send(self, topic, data):
+        self.waiting.append((self.subscriptions[topic][2], data))
+
+
+def test_the_node_runs_by_rclpy_where_that_is_installed(monkeypatch):
+    ros, store = FakeRos(monkeypatch), example.typestore()
+    stream = StreamTracker(lambda: load_config("file").new_tracker("saga"), shown=shown_tracks)
+    node = Ros2Node(stream, RecordingOptions({"lidar": "/objects"}), result_topics(["/tracks"]))
+    assert ros.running is not None
+    ros.offer("/objects", example.DETECTED, "best effort")
+    ros.offer("/tf", example.TF)
+    ros.offer("/tf_static", example.TF)
+
+    class Stop:
+        """Requests to stop when everything that was sent has been read."""
+
+        def __init__(self):
+            self.left = 10
+
+        def notify(self, act):
+            self.act = act
+
+    def payload(type_, content):
+        return bytes(store.serialize_cdr(example._typed(store, type_, content), type_))
+
+    stop, spin_once = Stop(), ros.spin_once
+
+    def played(timeout_sec):
+        if timeout_sec and not ros.waiting and stop.left:
+            k, stop.left = 10 - stop.left, stop.left - 1
+            ros.send("/tf_static", payload(example.TF, {"transforms": [example.BASE_TO_LIDAR]}))
+            ros.send("/tf", payload(example.TF, {"transforms": [example.map_to_base(k)]}))
+            ros.send("/objects", payload(example.DETECTED, example.detected_objects(k)))
+        elif timeout_sec:
+            stop.act()
+        spin_once(timeout_sec)
+
+    ros.spin_once = played
+    node.run(stop)
+    assert stream.status()["frames"] == 10
+    qualities = {topic: (q.reliability, q.durability) for topic, (_, q, _) in ros.subscriptions.items()}
+    assert qualities == {
+        "/objects": ("best effort", "volatile"),
+        "/tf": ("reliable", "volatile"),
+        "/tf_static": ("reliable", "transient"),
+    }
+    assert {(topic, kind) for topic, kind, _ in ros.published} == {("/tracks", TRACKED.replace("/", ".msg."))}
+    assert len(ros.published) == 10
+    tracked = message_objects(autoware_rows(payload_decoder(TRACKED)(ros.published[-1][2])), {})
+    expected = {label: place for label, place, *_ in example.objects(9)}
+    for label, place in zip(tracked.detections.boxes.label, tracked.detections.boxes.position, strict=True):
+        np.testing.assert_allclose(place, expected[label], atol=0.3)
+
+
+def test_packages_that_ros_lacks_and_other_types_are_named(monkeypatch, caplog):
+    ros = FakeRos(monkeypatch)
+    network = open_network({"/odom": ("nav_msgs/Odometry",), "/objects": (DETECTED,)}, "rclpy")
+    ros.offer("/objects", "std_msgs/msg/Header")
+    for _ in range(2):
+        assert network.received(0.0) == []
+    assert caplog.messages == [f"/objects: expected messages of {DETECTED}, std_msgs/Header is published: left out"]
+    ros.offer("/odom", "nav_msgs/msg/Odometry")
+    with pytest.raises(InputError, match="nav_msgs/Odometry: expected its package to be installed in ROS"):
+        network.received(0.0)
+
+
+def test_the_middleware_is_what_is_asked_for(monkeypatch):
+    assert isinstance(open_network({}), DdsNetwork)
+    with pytest.raises(MissingExtraError, match=r"rclpy comes with ROS 2: .* --middleware cyclonedds"):
+        open_network({}, "rclpy")
+    FakeRos(monkeypatch)
+    assert not isinstance(open_network({}), DdsNetwork)
+    assert isinstance(open_network({}, "cyclonedds"), DdsNetwork)
