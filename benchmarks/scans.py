@@ -344,7 +344,7 @@ def laser_drive(seed: int, rounds: float = 1.5, kind: LaserKind | None = None) -
     place = np.stack([np.cumsum(ahead * np.cos(heading[:-1])), np.cumsum(ahead * np.sin(heading[:-1]))], axis=1)
     odometry = np.column_stack([np.concatenate([np.zeros((1, 2)), place]), heading])
     time = np.asarray(_PERIOD * np.arange(n), dtype=np.float64)
-    log = LaserLog(time, ranges, angles, odometry, np.zeros(3))
+    log = LaserLog(time, ranges, np.tile(angles, (n, 1)), odometry, np.zeros(3))
     return log, np.linalg.inv(true[0]) @ true
 
 

@@ -136,10 +136,9 @@ def transforms(table: TextTable, record: Record) -> FloatArray:
         return geometry.transforms(values)
     quaternion = values[:, [6, 3, 4, 5]]
     norm = quaternion_norms(quaternion)
-    bad = np.abs(norm - 1) > _UNIT
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise table.fault(row, f"qx qy qz qw: expected a unit quaternion, got norm {norm[row]:.6g}")
+    table.check(
+        np.abs(norm - 1) <= _UNIT, lambda row: f"qx qy qz qw: expected a unit quaternion, got norm {norm[row]:.6g}"
+    )
     T = np.tile(np.eye(4), (len(values), 1, 1))
     T[:, :3, :3] = quaternion_rotation(quaternion / norm[:, None])
     T[:, :3, 3] = values[:, :3]
@@ -161,11 +160,9 @@ def _definite(edges: TextTable, matrix: FloatArray) -> FloatArray:
     """Project matrices (M, k, k) that are nearly positive definite."""
     values, vectors = np.linalg.eigh(matrix)
     smallest, largest, k = values[:, 0], values[:, -1], matrix.shape[1]
-    bad = (smallest < -_SLIGHT * largest) | (largest <= 0)
-    if bad.any():
-        row = int(np.argmax(bad))
-        named = "I11" if k == 1 else f"I11 ... I{k}{k}"
-        raise edges.fault(row, f"{named}: expected a positive definite matrix, smallest eigenvalue {smallest[row]:.3g}")
+    expected = f"I11 ... I{k}{k}: expected a positive definite matrix, smallest eigenvalue"
+    good = (smallest >= -_SLIGHT * largest) & (largest > 0)
+    edges.check(good, lambda row: f"{expected} {smallest[row]:.3g}")
     near = np.flatnonzero(smallest <= 0)
     if len(near):
         example = edges.fault(int(near[0]), f"smallest eigenvalue {smallest[near[0]]:.3g}")
@@ -205,13 +202,11 @@ def read_g2o(path: str | Path) -> PoseGraph:
     if _EDGE[d] not in tables:
         raise InputError(f"{file}: expected {_EDGE[d]} records, there are none")
     edges = tables[_EDGE[d]]
-    ends = np.stack([edges.integers(column, name, 0, _LARGEST_ID) for column, name in ((0, "first"), (1, "second"))])
     between, weights = transforms(edges, RECORDS[_EDGE[d]]), _information(edges, _EDGE[d])
     whole = _POSE[d] in tables
-    ids, order = _unique_ids(tables[_POSE[d]]) if whole else (np.unique(ends), np.arange(0))
-    first, second = (_rows(edges, named, name, ids) for named, name in zip(ends, ("first", "second"), strict=True))
-    if (first == second).any():
-        raise edges.fault(int(np.argmax(first == second)), "second: expected another pose than the first")
+    ids, order = _unique_ids(tables[_POSE[d]]) if whole else (_all_ends(edges), np.arange(0))
+    first, second = (_rows(edges, column, name, ids) for column, name in enumerate(("first", "second")))
+    edges.check(first != second, lambda row: "second: expected another pose than the first")
     priors, places = _priors(tables, d, ids), _places(tables, d, ids)
     _warn_of_fixed(file, fixed, ids, priors is not None or places is not None)
     if whole:
@@ -222,6 +217,11 @@ def read_g2o(path: str | Path) -> PoseGraph:
     marks = _landmarks(tables, graph, whole)
     _warn_of_unseen(file, tables, d, marks)
     return graph.with_landmarks(marks)
+
+
+def _all_ends(edges: TextTable) -> IntArray:
+    """Ids of the poses between which was measured, in increasing order."""
+    return np.unique([edges.integers(column, name, 0, _LARGEST_ID) for column, name in enumerate(("first", "second"))])
 
 
 def _warn_of_unseen(file: Path, tables: Tables, d: int, marks: PointLandmarks | None) -> None:
@@ -245,7 +245,7 @@ def _priors(tables: Tables, d: int, ids: IntArray) -> PosePriors | None:
     if (tag := _PRIOR[d]) not in tables:
         return None
     table = tables[tag]
-    rows = _rows(table, table.integers(0, "pose", 0, _LARGEST_ID), "pose", ids)
+    rows = _rows(table, 0, "pose", ids)
     poses, weights = transforms(table, RECORDS[tag]), _information(table, tag)
     if d == 3:  # measured is pose T offset, with errors in the sensor's frame
         sensor_T_pose = np.linalg.inv(_offsets(tables, table, 1))
@@ -258,7 +258,7 @@ def _places(tables: Tables, d: int, ids: IntArray) -> PositionPriors | None:
     if (tag := _PLACE[d]) not in tables:
         return None
     table, record = tables[tag], RECORDS[tag]
-    rows = _rows(table, table.integers(0, "pose", 0, _LARGEST_ID), "pose", ids)
+    rows = _rows(table, 0, "pose", ids)
     return PositionPriors(rows, record_values(table, record), information(table, record))
 
 
@@ -272,13 +272,11 @@ def _landmarks(tables: Tables, graph: PoseGraph, guessed: bool) -> PointLandmark
     ids, landmark = np.unique(named, return_inverse=True)
     if (vertex := _LANDMARK[d]) in tables:
         given, order = _unique_ids(tables[vertex])
-        _rows(table, named, "landmark", given)
+        _rows(table, 1, "landmark", given)
         if guessed:
             position = record_values(tables[vertex], RECORDS[vertex])[order][np.searchsorted(given, ids)]
-    if (both := np.isin(named, graph.ids)).any():
-        row = int(np.argmax(both))
-        raise table.fault(row, f"landmark: {named[row]} is a pose")
-    pose = _rows(table, table.integers(0, "pose", 0, _LARGEST_ID), "pose", graph.ids)
+    table.check(~np.isin(named, graph.ids), lambda row: f"landmark: {named[row]} is a pose")
+    pose = _rows(table, 0, "pose", graph.ids)
     z, weights = record_values(table, RECORDS[tag]), information(table, RECORDS[tag])
     if d == 3:
         T = _offsets(tables, table, 2)
@@ -290,52 +288,45 @@ def _landmarks(tables: Tables, graph: PoseGraph, guessed: bool) -> PointLandmark
 
 def _offsets(tables: Tables, table: TextTable, column: int) -> FloatArray:
     """Poses (n, 4, 4) of the sensors that a column names."""
-    named = table.integers(column, "offset", 0, _LARGEST_ID)
-    if _OFFSET not in tables:
-        if (named != 0).any():
-            raise table.fault(int(np.argmax(named != 0)), f"offset: there is no {_OFFSET} record")
-        return np.tile(np.eye(4), (len(named), 1, 1))
+    if _OFFSET not in tables:  # but the one that every file has
+        return np.eye(4)[None][_rows(table, column, "offset", np.zeros(1, dtype=np.int64))]
     ids, order = _unique_ids(tables[_OFFSET])
-    rows = _rows(table, named, "offset", ids)
-    return transforms(tables[_OFFSET], RECORDS[_OFFSET])[order][rows]
+    return transforms(tables[_OFFSET], RECORDS[_OFFSET])[order][_rows(table, column, "offset", ids)]
 
 
 def write_g2o(path: str | Path, graph: PoseGraph) -> None:
     """Write a pose graph, whole or not at all. Raises `InputError` where that is not possible."""
-    d, names = graph.dim, graph.ids
-    lines = [
-        f"{_POSE[d]} {id_} {_numbers(row)}"
-        for id_, row in zip(names.tolist(), _columns(graph.world_T_pose), strict=True)
-    ]
-    marks, priors = graph.landmarks, graph.priors
+    d, names, marks = graph.dim, graph.ids, graph.landmarks
+    lines = _lines(_POSE[d], names[:, None], pose_columns(graph.world_T_pose))
     if marks is not None:
-        lines += [
-            f"{_LANDMARK[d]} {id_} {_numbers(row)}" for id_, row in zip(marks.ids.tolist(), marks.position, strict=True)
-        ]
-    if d == 3 and not graph.poses_alone:
+        lines += _lines(_LANDMARK[d], marks.ids[:, None], marks.position)
+    if d == 3 and (marks is not None or graph.anchored):
         lines.append(f"{_OFFSET} 0 0 0 0 0 0 0 1")
     ends = np.stack([names[graph.first], names[graph.second]], axis=1)
-    lines += _lines(_EDGE[d], ends, _columns(graph.first_T_second), _upper(graph.information, d))
-    if priors is not None:
-        pose = names[priors.pose][:, None]
-        pose = pose if d == 2 else np.column_stack([pose, np.zeros_like(pose)])
-        lines += _lines(_PRIOR[d], pose, _columns(priors.world_T_pose), _upper(priors.information, d))
+    lines += _lines(_EDGE[d], ends, pose_columns(graph.first_T_second), _in_file_order(graph.information, d))
+    if (priors := graph.priors) is not None:
+        poses, weights = pose_columns(priors.world_T_pose), _in_file_order(priors.information, d)
+        lines += _lines(_PRIOR[d], _without_offset(d, names[priors.pose]), poses, weights)
     if (places := graph.places) is not None:
-        pose = np.column_stack([names[places.pose], np.zeros_like(places.pose)])[:, : d - 1]
-        i, j = np.triu_indices(d)
-        lines += _lines(_PLACE[d], pose, places.position, places.information[:, i, j])
+        lines += _lines(_PLACE[d], _without_offset(d, names[places.pose]), places.position, places.information)
     if marks is not None:
-        seen = np.column_stack([names[marks.pose], marks.ids[marks.landmark], np.zeros_like(marks.pose)])[:, :d]
-        i, j = np.triu_indices(d)
-        lines += _lines(_OBSERVED[d], seen, marks.z, marks.information[:, i, j])
+        seen = _without_offset(d, names[marks.pose], marks.ids[marks.landmark])
+        lines += _lines(_OBSERVED[d], seen, marks.z, marks.information)
     write_text(path, "\n".join(lines) + "\n")
 
 
-def _lines(tag: str, ids: IntArray, values: FloatArray, weights: FloatArray) -> list[str]:
-    return [
-        f"{tag} {' '.join(map(str, named))} {_numbers(row)} {_numbers(entries)}"
-        for named, row, entries in zip(ids.tolist(), values, weights, strict=True)
-    ]
+def _lines(tag: str, ids: IntArray, values: FloatArray, weights: FloatArray | None = None) -> list[str]:
+    """Records of ids (n, i), values (n, c) and the upper triangles of matrices (n, k, k)."""
+    if weights is not None:
+        i, j = np.triu_indices(weights.shape[1])
+        values = np.hstack([values, weights[:, i, j]])
+    rows = zip(ids.tolist(), values, strict=True)
+    return [f"{tag} {' '.join(map(str, named))} {' '.join(f'{x:.17g}' for x in row)}" for named, row in rows]
+
+
+def _without_offset(d: int, *ids: IntArray) -> IntArray:
+    """Columns of ids, in space with that of the sensor without an offset."""
+    return np.column_stack([*ids, np.zeros_like(ids[0])])[:, : len(ids) + d - 2]
 
 
 def _information(table: TextTable, tag: str) -> FloatArray:
@@ -345,40 +336,33 @@ def _information(table: TextTable, tag: str) -> FloatArray:
     return information(table, record)[:, tangent[:, None], tangent]
 
 
-def _upper(matrices: FloatArray, d: int) -> FloatArray:
-    """Upper triangles of information matrices of poses, in the order of the file."""
+def _in_file_order(matrices: FloatArray, d: int) -> FloatArray:
+    """Information matrices of poses in the order of the file."""
     back = np.argsort(_TANGENT[d])
-    i, j = np.triu_indices(len(back))
-    return np.asarray(matrices[:, back[:, None], back][:, i, j])
+    return np.asarray(matrices[:, back[:, None], back])
 
 
 def _unique_ids(table: TextTable) -> tuple[IntArray, IntArray]:
     """Ids in increasing order, and their rows."""
     ids = table.integers(0, "id", 0, _LARGEST_ID)
     order = np.argsort(ids, kind="stable")
-    twice = np.flatnonzero(ids[order][1:] == ids[order][:-1])
-    if len(twice):
-        row = int(order[twice[0] + 1])
-        raise table.fault(row, f"id: {ids[row]} is given twice")
+    new = np.ones(len(ids), dtype=np.bool_)
+    new[order[1:]] = np.diff(ids[order]) > 0
+    table.check(new, lambda row: f"id: {ids[row]} is given twice")
     return ids[order], order.astype(np.int64)
 
 
-def _rows(table: TextTable, named: IntArray, name: str, ids: IntArray) -> IntArray:
+def _rows(table: TextTable, column: int, name: str, ids: IntArray) -> IntArray:
     """Rows of what a column of a table names."""
+    named = table.integers(column, name, 0, _LARGEST_ID)
     rows = np.minimum(np.searchsorted(ids, named), len(ids) - 1)
-    if (ids[rows] != named).any():
-        row = int(np.argmax(ids[rows] != named))
-        what = name if name in ("landmark", "offset") else "pose"
-        raise table.fault(row, f"{name}: there is no {what} {named[row]}")
+    what = name if name in ("landmark", "offset") else "pose"
+    table.check(ids[rows] == named, lambda row: f"{name}: there is no {what} {named[row]}")
     return rows.astype(np.int64)
 
 
-def _columns(T: FloatArray) -> FloatArray:
-    """Poses as the columns of the file."""
+def pose_columns(T: FloatArray) -> FloatArray:
+    """Poses as the columns of records: x y heading (n, 3), or x y z qx qy qz qw (n, 7)."""
     if T.shape[1] == 3:
-        return np.column_stack([T[:, 0, 2], T[:, 1, 2], np.arctan2(T[:, 1, 0], T[:, 0, 0])])
+        return geometry.vectors(T)
     return np.column_stack([T[:, :3, 3], rotation_quaternion(T[:, :3, :3])[:, [1, 2, 3, 0]]])
-
-
-def _numbers(row: FloatArray) -> str:
-    return " ".join(f"{x:.17g}" for x in row)

@@ -10,7 +10,7 @@ words NaN and Infinity in result files (ijson, equally fast, refuses them).
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from data_tools.files.file_access import open_bytes, open_text, read_text
 from data_tools.files.isolated_reading import isolated
 from saga_fg.errors import InputError, MissingExtraError, error_context
-from saga_fg.numerics import FloatArray
+from saga_fg.numerics import BoolArray, FloatArray
 
 LONGEST = 100  # characters of a value
 LARGEST = 1e15  # largest number; its square does not overflow
@@ -93,6 +93,12 @@ class TextTable:
             row = int(np.argmax(bad))
             raise self.fault(row, f"{name}: expected a whole number from {smallest} to {largest}, got {text[row][:40]}")
         return numbers
+
+    def check(self, good: BoolArray, what: Callable[[int], str]) -> None:
+        """Raise `InputError` about the first row that is not good (N,); what: says what is wrong with a row."""
+        if not good.all():
+            row = int(np.argmin(good))
+            raise self.fault(row, what(row))
 
     def fault(self, row: int, what: str) -> InputError:
         """An error about one row."""

@@ -46,7 +46,7 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True, eq=False)
 class LaserLog:
     """time (n,) s, as logged, in the order of the file, not always sorted; ranges (n, m) m, NaN where nothing
-    was hit; angles (n, m) rad from ahead, or (m,) of all scans; odometry (n, 3) of the robot, m and rad;
+    was hit; angles (n, m) rad from ahead; odometry (n, 3) of the robot, m and rad;
     robot_T_laser (3,): x, y, heading. Scans of fewer readings than others end in NaN.
     """
 
@@ -61,16 +61,12 @@ class LaserLog:
 
     def first(self, count: int) -> LaserLog:
         """The first scans."""
-        columns = ("time", "ranges", "odometry", *(["angles"] if self.angles.ndim == 2 else []))
+        columns = ("time", "ranges", "angles", "odometry")
         return replace(self, **{name: getattr(self, name)[:count] for name in columns})
-
-    def directions(self, row: int) -> FloatArray:
-        """The angles (m,) of a scan, rad."""
-        return self.angles[row] if self.angles.ndim == 2 else self.angles
 
     def points(self, row: int, largest_range: float = np.inf) -> FloatArray:
         """Points (n, 2) that a scan hit, m, in the laser's frame."""
-        r, angles = self.ranges[row], self.directions(row)
+        r, angles = self.ranges[row], self.angles[row]
         hit = r < largest_range
         return np.asarray(r[hit, None] * np.stack([np.cos(angles[hit]), np.sin(angles[hit])], axis=1))
 
@@ -103,8 +99,6 @@ def read_carmen(path: str | Path) -> LaserLog:
         fields = line.split()[1:]
         values, directions, most = _flaser(where, fields) if tag == "FLASER" else _robotlaser(where, fields)
         chosen, readings = tag, len(directions)
-        if angles and len(angles[-1]) == readings and (angles[-1] == directions).all():
-            directions = angles[-1]
         ranges.append(values[1 : 1 + readings])
         angles.append(directions)
         rest.append(np.concatenate([values[:1], values[1 + readings :]]))
@@ -118,8 +112,7 @@ def read_carmen(path: str | Path) -> LaserLog:
     nothing = 0.999 * _nothing(measured)
     measured = np.where((measured > 0) & (measured < np.minimum(largest, nothing)[:, None]), measured, np.nan)
     laser, robot = table[:, 1:4], table[:, 4:]
-    alike = all(each is angles[0] for each in angles)
-    return LaserLog(table[:, 0], measured, angles[0] if alike else padded(angles), robot, _mounting(robot, laser))
+    return LaserLog(table[:, 0], measured, padded(angles), robot, _mounting(robot, laser))
 
 
 def _flaser(where: str, fields: list[str]) -> tuple[FloatArray, FloatArray, float]:

@@ -283,8 +283,8 @@ class ScoreGrid:
         bound = self._scores(top, cells, angle, dx, dy)
         best = least
         for level in range(top, 0, -1):
-            lead = int(np.argmax(bound))  # a way straight down tells a score that is really reached
-            best = max(best, self._descended(level, n, cells, angle[lead], dx[lead], dy[lead]))
+            lead = int(np.argmax(bound))
+            best = max(best, self._reached(level, n, cells, angle[lead], dx[lead], dy[lead]))
             keep = bound >= max(least, _RIVAL * best)
             if not keep.any():
                 return None
@@ -303,17 +303,10 @@ class ScoreGrid:
         found = np.array([pose[0] + dx[lead] * CELL, pose[1] + dy[lead] * CELL, angles[angle[lead]]])
         return Found(found, float(bound[lead]), rival)
 
-    def _descended(self, level: int, n: int, cells: IntArray, angle: int, dx: int, dy: int) -> float:
-        """A score that is reached inside the square, within shifts of n cells."""
-        score = 0.0
-        for down in range(level - 1, -1, -1):
-            xs, ys = dx + 2**down * np.array([0, 0, 1, 1]), dy + 2**down * np.array([0, 1, 0, 1])
-            inside = (xs <= n) & (ys <= n)
-            xs, ys = xs[inside], ys[inside]
-            scores = self._scores(down, cells, np.full(len(xs), angle), xs, ys)
-            lead = int(np.argmax(scores))
-            dx, dy, score = xs[lead], ys[lead], float(scores[lead])
-        return score
+    def _reached(self, level: int, n: int, cells: IntArray, angle: int, dx: int, dy: int) -> float:
+        """The best score in a square of a level, within shifts of n cells."""
+        xs, ys = np.meshgrid(*(np.arange(at, min(at + 2**level - 1, n) + 1) for at in (dx, dy)))
+        return float(self._scores(0, cells, np.full(xs.size, angle), xs.ravel(), ys.ravel()).max())
 
     def _scores(self, level: int, cells: IntArray, angle: IntArray, dx: IntArray, dy: IntArray) -> FloatArray:
         """Mean scores (k,) of a level for shifts in cells."""

@@ -24,16 +24,15 @@ Headers of PCD and PLY are checked against the data after them. Sources: develop
 https://pointclouds.org/documentation/tutorials/pcd_file_format.html; G. Turk, The PLY polygon file format, 1994; LAS
 specification 1.4 R15.
 
-Open3D writes clouds, and reads compressed PCD.
+Open3D reads compressed PCD.
 """
 
 import struct
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from io import SEEK_END
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -216,8 +215,9 @@ def _grows(values: NDArray[Any]) -> bool:
     return len(values) > 1 and bool((np.diff(values) >= 0).mean() > 0.9)
 
 
-_PCD_KEYS = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "POINTS", "DATA")
+_PCD_KEYS = ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA")
 _PCD_TYPES = {("F", 4), ("F", 8), *((kind, size) for kind in "IU" for size in (1, 2, 4, 8))}
+_PLY_FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
 _PLY_TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -240,28 +240,22 @@ def pcd_columns(path: Path) -> Columns:
     Raises `InputError` where the header is broken or promises more than there is.
     """
     lines, body = _header(read_bytes(path), b"DATA")
-    found: dict[str, list[str]] = {}
-    for line in lines:
-        key, *values = line.split() or ["#"]
-        if not key.startswith("#"):
-            found[key] = values
-    missing = [key for key in _PCD_KEYS if key not in found and key != "COUNT"]
-    if missing:
-        _fault(f"a line {missing[0]}")
+    found = {words[0]: words[1:] for words in map(str.split, lines) if words}
+    for key in _PCD_KEYS:
+        _expect(key in found, f"a line {key}")
     fields = found["FIELDS"]
     sizes, counts = (
         _numbers(key, found.get(key, ["1"] * len(fields)), len(fields), 8 if key == "SIZE" else MOST_VALUES)
         for key in ("SIZE", "COUNT")
     )
-    if len(found["TYPE"]) != len(fields) or not {"x", "y", "z"} <= set(fields):
-        _fault("fields x, y and z, and a TYPE for each")
-    if not set(zip(found["TYPE"], sizes, strict=True)) <= _PCD_TYPES:
-        _fault("types F of 4 or 8 bytes, I or U of 1 to 8")
-    if any(count != 1 for name, count in zip(fields, counts, strict=True) if name in ("x", "y", "z")):
-        _fault("one x, one y and one z a point")
+    _expect(
+        len(found["TYPE"]) == len(fields) and {"x", "y", "z"} <= set(fields), "fields x, y and z, and a TYPE for each"
+    )
+    _expect(set(zip(found["TYPE"], sizes, strict=True)) <= _PCD_TYPES, "types F of 4 or 8 bytes, I or U of 1 to 8")
+    places = {count for name, count in zip(fields, counts, strict=True) if name in ("x", "y", "z")}
+    _expect(places == {1}, "one x, one y and one z a point")
     width, height, points = (_numbers(key, found[key], 1, 2**31 - 1, 0)[0] for key in ("WIDTH", "HEIGHT", "POINTS"))
-    if points != width * height:
-        _fault("POINTS to be WIDTH x HEIGHT")
+    _expect(points == width * height, "POINTS to be WIDTH x HEIGHT")
     kinds = [f"<{kind.lower()}{size}" for kind, size in zip(found["TYPE"], sizes, strict=True)]
     record = np.dtype([(str(k), kind, (count,)) for k, (kind, count) in enumerate(zip(kinds, counts, strict=True))])
     match found["DATA"][:1]:
@@ -273,12 +267,11 @@ def pcd_columns(path: Path) -> Columns:
             columns = [rows[str(k)] for k in range(len(fields))]
         case ["binary_compressed"]:
             packed, unpacked = struct.unpack("<II", body[:8]) if len(body) >= 8 else (0, -1)
-            if unpacked != points * record.itemsize:
-                _fault(f"{points * record.itemsize} bytes of compressed points")
+            _expect(unpacked == points * record.itemsize, f"{points * record.itemsize} bytes of compressed points")
             _room(body[8:], packed)
             return dict(isolated("expected a point cloud that Open3D can read", _open3d_columns, path))
         case _:
-            _fault("DATA to be ascii, binary or binary_compressed")
+            raise InputError("expected DATA to be ascii, binary or binary_compressed")
     single = [k for k, count in enumerate(counts) if count == 1]
     return {fields[k]: columns[k][:, 0] for k in reversed(single)}  # of two of one name the first
 
@@ -297,28 +290,25 @@ def ply_columns(content: bytes) -> Columns:
     """Raises `InputError` where the header of a PLY file is broken or promises more than there is."""
     lines, body = _header(content, b"end_header")
     words = [line.split() for line in lines if line.split() and line.split()[0] not in ("comment", "obj_info")]
-    if not words or words[0] != ["ply"] or len(words) < 2 or words[1][:1] != ["format"] or len(words[1]) != 3:
-        _fault("the lines ply and format")
+    begins = [line[:1] for line in words[:2]] == [["ply"], ["format"]]
+    _expect(begins and len(words[0]) == 1 and len(words[1]) == 3, "the lines ply and format")
     form = words[1][1]
-    if form not in ("ascii", "binary_little_endian", "binary_big_endian"):
-        _fault("the format ascii, binary_little_endian or binary_big_endian")
-    if words[-1] != ["end_header"]:
-        _fault("a line with end_header alone")
-    if len(words) < 4 or words[2][:2] != ["element", "vertex"] or len(words[2]) != 3:
-        _fault("vertices as the first element")
+    _expect(form in _PLY_FORMATS, f"the format {', '.join(_PLY_FORMATS)}")
+    _expect(words[-1] == ["end_header"], "a line with end_header alone")
+    first = words[2] if len(words) > 3 else []
+    _expect(first[:2] == ["element", "vertex"] and len(first) == 3, "vertices as the first element")
     (points,) = _numbers("element vertex", words[2][2:], 1, 2**31 - 1, 0)
     properties = []
     for line in words[3:-1]:
         if line[0] != "property":
             break
-        if len(line) != 3 or line[1] not in _PLY_TYPES:
-            _fault("vertices with properties of one number each")
+        _expect(len(line) == 3 and line[1] in _PLY_TYPES, "vertices with properties of one number each")
         properties.append(line)
     names = [line[2] for line in properties]
-    if not {"x", "y", "z"} <= set(names) or len(set(names)) != len(names) or len(names) > MOST_VALUES:
-        _fault("properties x, y and z, and each once")
-    if any(line[:1] == ["element"] and _numbers("element", line[2:], 1, 2**31 - 1, 0) != [0] for line in words[3:]):
-        _fault("vertices alone")
+    once = len(set(names)) == len(names) <= MOST_VALUES
+    _expect(once and {"x", "y", "z"} <= set(names), "properties x, y and z, and each once")
+    others = [_numbers("element", line[2:], 1, 2**31 - 1, 0) for line in words[3:] if line[0] == "element"]
+    _expect(not any(map(any, others)), "vertices alone")
     if form == "ascii":
         return dict(zip(names, _rows(body, points, len(properties)).T, strict=True))
     order = "<" if form == "binary_little_endian" else ">"
@@ -334,10 +324,9 @@ def _header(content: bytes, last: bytes) -> tuple[list[str], bytes]:
         end = len(content) if end < 0 else end
         line = content[at:end]
         at = end + 1
-        if not line.isascii() or b"\0" in line:
-            _fault("a header of plain text")
-        if len(line) > LONGEST_LINE or max(map(len, line.split()), default=0) > LONGEST_WORD:
-            _fault(f"a header with lines of at most {LONGEST_LINE} and words of at most {LONGEST_WORD} bytes")
+        _expect(line.isascii() and b"\0" not in line, "a header of plain text")
+        short = len(line) <= LONGEST_LINE and max(map(len, line.split()), default=0) <= LONGEST_WORD
+        _expect(short, f"a header with lines of at most {LONGEST_LINE} and words of at most {LONGEST_WORD} bytes")
         lines.append(line.decode("ascii").rstrip("\r"))
         if line.startswith(last):
             return lines, content[at:]
@@ -345,8 +334,8 @@ def _header(content: bytes, last: bytes) -> tuple[list[str], bytes]:
 
 
 def _numbers(what: str, words: Sequence[str], count: int, most: int, least: int = 1) -> list[int]:
-    if len(words) != count or not all(word.isdecimal() and least <= int(word[:20]) <= most for word in words):
-        _fault(f"{what} to be {count} whole numbers from {least} to {most}")
+    whole = len(words) == count and all(word.isdecimal() and least <= int(word[:20]) <= most for word in words)
+    _expect(whole, f"{what} to be {count} whole numbers from {least} to {most}")
     return [int(word) for word in words]
 
 
@@ -359,8 +348,7 @@ def _rows(body: bytes, points: int, values: int) -> FloatArray:
         table = np.loadtxt(lines, comments=None, ndmin=2, encoding="latin-1") if len(lines) == points else np.empty(0)
     except ValueError:
         table = np.empty(0)
-    if table.shape != (points, values):
-        _fault(f"{points} lines of {values} numbers after the header")
+    _expect(table.shape == (points, values), f"{points} lines of {values} numbers after the header")
     return table
 
 
@@ -370,12 +358,13 @@ def _records(body: bytes, record: np.dtype[Any], points: int) -> NDArray[Any]:
 
 
 def _room(body: bytes, size: int) -> None:
-    if len(body) < size:
-        _fault(f"{size} bytes after the header, there are {len(body)}")
+    _expect(len(body) >= size, f"{size} bytes after the header, there are {len(body)}")
 
 
-def _fault(expected: str) -> NoReturn:
-    raise InputError(f"expected {expected}")
+def _expect(found: bool, what: str) -> None:
+    """Raise `InputError` unless what was expected is found."""
+    if not found:
+        raise InputError(f"expected {what}")
 
 
 def _array(path: Path) -> Columns:
@@ -447,27 +436,22 @@ _READERS: dict[str, Callable[[Path], Columns]] = {
 SUFFIXES = tuple(_READERS)
 
 
+_CLOUD_HEADERS = {
+    ".ply": "ply\nformat binary_little_endian 1.0\nelement vertex {0}\n"
+    "property float x\nproperty float y\nproperty float z\nend_header\n",
+    ".pcd": "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\n"
+    "VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {0}\nDATA binary\n",
+}
+
+
 def write_cloud(path: str | Path, points: FloatArray) -> None:
     """Write points (N, 3), m, as float32, atomically.
 
     path: .ply or .pcd
     Raises `InputError` for another suffix, and positions that are not finite.
     """
-    points, suffix = checked("points", points, (None, 3)), Path(path).suffix.lower()
-    if suffix not in (".ply", ".pcd"):
+    header = _CLOUD_HEADERS.get(Path(path).suffix.lower())
+    if header is None:
         raise InputError(f"{path}: expected a name that ends in .ply or .pcd")
-    if not len(points) and suffix == ".ply":  # which Open3D refuses
-        write_bytes(path, _EMPTY.encode("ascii"))
-        return
-    open3d = load_open3d()
-    cloud = open3d.t.geometry.PointCloud(open3d.core.Tensor(np.ascontiguousarray(points, dtype=np.float32)))
-    with tempfile.TemporaryDirectory() as folder:
-        whole = Path(folder) / f"cloud{suffix}"
-        if not open3d.t.io.write_point_cloud(str(whole), cloud):
-            raise InputError(f"{path}: Open3D cannot write it")
-        write_bytes(path, whole.read_bytes())
-
-
-_EMPTY = "\n".join(
-    ["ply", "format ascii 1.0", "element vertex 0", *(f"property float {axis}" for axis in "xyz"), "end_header", ""]
-)
+    content = checked("points", points, (None, 3)).astype("<f4").tobytes()
+    write_bytes(path, header.format(len(points)).encode("ascii") + content)

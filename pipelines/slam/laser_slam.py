@@ -98,7 +98,7 @@ def check_wheels(log: LaserLog) -> None:
     """Raise `InputError` where the wheels say one pose throughout while what the laser sees changes."""
     if len(log) < 2 or np.ptp(log.odometry, axis=0).max() > _STILL:
         return
-    alike = np.broadcast_to(np.isclose(log.angles, log.directions(0)), log.ranges.shape)  # not so of interlaced lasers
+    alike = np.isclose(log.angles, log.angles[0])  # not so of interlaced lasers
     changed = (alike & (np.abs(log.ranges - log.ranges[0]) > _CHANGED)).sum(axis=1) / np.maximum(alike.sum(axis=1), 1)
     if (moved := int(np.argmax(changed > _MANY))) > 0:
         raise InputError(

@@ -168,7 +168,8 @@ def test_interlaced_scans_are_as_good_as_others(tmp_path: Path) -> None:
     log, true = laser_drive(0, rounds=0.2, kind=LaserKind(readings=360))
     lines = []
     for row, (time, pose) in enumerate(zip(log.time, log.odometry, strict=True)):
-        angles, ranges = (values[row % 2 :: 2] for values in (log.angles, np.nan_to_num(log.ranges[row], nan=81.91)))
+        both = (log.angles[row], np.nan_to_num(log.ranges[row], nan=81.91))
+        angles, ranges = (values[row % 2 :: 2] for values in both)
         at = " ".join(f"{value:.6f}" for value in pose)
         step = angles[1] - angles[0]
         head = f"ROBOTLASER1 0 {angles[0]:.6f} {np.pi:.6f} {step:.8f} 81.9 0.01 0 {len(ranges)}"

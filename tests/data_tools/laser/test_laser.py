@@ -33,7 +33,7 @@ def test_both_records_say_the_same(tmp_path, record, last):
     log = read_carmen(tmp_path / "two.log")
     assert log.time.tolist() == [17.5, 18.5]
     np.testing.assert_allclose(log.ranges[0, :10], 1 + np.arange(10) / 10)
-    np.testing.assert_allclose(log.angles[[0, -1]], [-last, last], atol=1e-9)
+    np.testing.assert_allclose(log.angles[:, [0, -1]], [[-last, last]] * 2, atol=1e-9)
     assert log.odometry[0, :2].tolist() == [1, 2]
     assert np.isnan(log.ranges[0, 10])  # the largest, which recurs
 
@@ -53,7 +53,7 @@ def test_both_records_say_the_same(tmp_path, record, last):
 def test_directions_are_those_that_carmen_guesses(tmp_path, readings, first, last):
     ranges = " ".join(f"{1 + k / 1000:.3f}" for k in range(readings))
     (tmp_path / "drive.log").write_text(f"FLASER {readings} {ranges} 0 0 0 0 0 0 17.5 nohost 0.1\n")
-    angles = np.rad2deg(read_carmen(tmp_path / "drive.log").angles)
+    (angles,) = np.rad2deg(read_carmen(tmp_path / "drive.log").angles)
     np.testing.assert_allclose(angles[[0, -1]], [first, last], atol=1e-9)
 
 
@@ -82,16 +82,16 @@ def test_directions_are_those_of_each_record(tmp_path):
     interlaced = ROBOT.replace("-1.57 3.14", "-1.413 3.14").replace("17.5", "18.5")
     (tmp_path / "two.log").write_text(ROBOT + interlaced + ROBOT.replace("17.5", "19.5"))
     log = read_carmen(tmp_path / "two.log")
-    np.testing.assert_allclose(log.directions(1) - log.directions(0), 0.157)
+    np.testing.assert_allclose(log.angles[1] - log.angles[0], 0.157)
     for row in (0, 1):
         points = log.points(row)
-        np.testing.assert_allclose(np.arctan2(points[:, 1], points[:, 0]), log.directions(row)[: len(points)])
+        np.testing.assert_allclose(np.arctan2(points[:, 1], points[:, 0]), log.angles[row][: len(points)])
     shorter = FLASER.replace("FLASER 11 1.00", "FLASER 10")
     (tmp_path / "three.log").write_text(FLASER + shorter + FLASER)
     log = read_carmen(tmp_path / "three.log").first(2)
     assert log.ranges.shape == log.angles.shape == (2, 11)
-    np.testing.assert_allclose(log.directions(0), np.linspace(-np.pi / 2, np.pi / 2, 11))
-    np.testing.assert_allclose(log.directions(1)[:10], np.linspace(-np.pi / 2, np.pi / 2, 10))
+    np.testing.assert_allclose(log.angles[0], np.linspace(-np.pi / 2, np.pi / 2, 11))
+    np.testing.assert_allclose(log.angles[1][:10], np.linspace(-np.pi / 2, np.pi / 2, 10))
     assert np.isnan(log.ranges[1, 10])
     assert log.points(1)[0, 1] == pytest.approx(-1.1)
 

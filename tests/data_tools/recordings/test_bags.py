@@ -224,7 +224,7 @@ def laser_messages(log, robot_T_laser=None):
         edge = static_transform("base_link", "laser", robot_T_laser)
         found.append(("/tf_static", example.TF, edge, round(BEGIN * 1e9)))
     for k, (time, pose) in enumerate(zip(BEGIN + log.time, transforms(log.odometry), strict=True)):
-        angles = log.directions(k)
+        angles = log.angles[k]
         placed = np.eye(4)
         placed[:2, :2], placed[:2, 3] = pose[:2, :2], pose[:2, 2]
         at = round(time * 1e9)
@@ -241,7 +241,7 @@ def test_a_laser_and_its_wheels(tmp_path: Path, form: str) -> None:
     found = read_bag_laser(written(tmp_path, form, laser_messages(log, mount)))
     np.testing.assert_allclose(found.time - BEGIN, log.time, atol=1e-6)
     np.testing.assert_allclose(found.ranges, log.ranges, atol=1e-5)
-    np.testing.assert_allclose(found.directions(3), log.directions(3), atol=1e-5)
+    np.testing.assert_allclose(found.angles[3], log.angles[3], atol=1e-5)
     np.testing.assert_allclose(found.odometry, log.odometry, atol=1e-6)
     np.testing.assert_allclose(found.robot_T_laser, [0.2, 0.0, 0.1], atol=1e-9)
 
