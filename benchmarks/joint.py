@@ -73,7 +73,6 @@ from saga_fg.slam.joint.record import (
     MAX_ITERATIONS,
     EpochRecorder,
     RecordedEpoch,
-    SlowErrors,
     in_ego,
     stationary_probabilities,
 )
@@ -139,7 +138,7 @@ class OnlineEstimator:
         self._smoother = IncrementalSmoother(providers, None, RelinearisationSettings(_THRESHOLD, MAX_ITERATIONS))
         self._recorder = EpochRecorder(tracker)
         self._start = np.eye(4) if start is None else checked_transform("start", start)
-        self._slow = SlowErrors.at_start(self._settings)
+        self._slow = self._settings.odometry.slow
         self._pairs, self._stationary = StationaryPairs(), list[FloatArray]()
         self._record = list[RecordedEpoch]()  # of the window
         self._solution: GraphSolution | None = None

@@ -65,7 +65,6 @@ from saga_fg.slam.joint.record import (
     OdometryIncrements,
     RecordedEpoch,
     RecordedObjects,
-    SlowErrors,
     motion_covariances,
     record_epochs,
     stationary_probabilities,
@@ -156,7 +155,8 @@ def stationary_factors(record: Record, stationary: Sequence[FloatArray]) -> list
             rows.append((now.objects.types[here[row]], both, p[row], now.time - before.time))
     factors: list[ResidualFactors] = []
     for node_type, (keys, p, dt) in _by_type(rows):
-        model = _StationaryResidual(node_type.dim, tuple(node_type.index(POSITION)), tuple(node_type.index(VELOCITY)))
+        at, speeds = node_type.selector(POSITION), node_type.selector(VELOCITY)
+        model = _Linear(np.concatenate([-at, 0 * speeds]), np.concatenate([at, speeds]))  # (p' - p, v')
         drift, speed = STATIONARY_DRIFT**2 * dt, np.full(len(dt), STATIONARY_SPEED**2)
         factors.append(
             ResidualFactors(
@@ -172,23 +172,18 @@ def stationary_factors(record: Record, stationary: Sequence[FloatArray]) -> list
     return factors
 
 
-@dataclass(frozen=True)
-class _StationaryResidual:
-    """(p' - p, v') of states (N, dim)."""
+@dataclass(frozen=True, eq=False)
+class _Linear:
+    """B x + C x' of states (N, dim) at two epochs."""
 
-    dim: int
-    position: tuple[int, ...]
-    velocity: tuple[int, ...]
+    B: FloatArray
+    C: FloatArray
 
     def residual(self, before: FloatArray, now: FloatArray) -> FloatArray:
-        at_p, at_v = list(self.position), list(self.velocity)
-        return np.concatenate([now[:, at_p] - before[:, at_p], now[:, at_v]], axis=1)
+        return np.asarray(before @ self.B.T + now @ self.C.T)
 
     def jacobians(self, before: FloatArray, now: FloatArray) -> Sequence[FloatArray]:
-        J_before, J_now = np.zeros((2, len(now), 4, self.dim))
-        J_before[:, [0, 1], list(self.position)] = -1.0
-        J_now[:, [0, 1, 2, 3], [*self.position, *self.velocity]] = 1.0
-        return [J_before, J_now]
+        return [np.tile(each, (len(now), 1, 1)) for each in (self.B, self.C)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,11 +240,11 @@ class JointEstimate:
         return Assignment(seen.id, seen.row)
 
     @cached_property
-    def slow_errors(self) -> SlowErrors:
-        """Deviations of the odometry's slow errors: mean over the first, the middle and the last epoch."""
+    def slow_errors(self) -> FloatArray:
+        """Deviations (3,) of the odometry's slow errors: mean over the first, the middle and the last epoch."""
         n = len(self._record)
         P = np.stack([self.solution.marginal(error_key(self._record[row].epoch)) for row in (0, n // 2, n - 1)])
-        return SlowErrors(*np.sqrt(np.diagonal(P, axis1=1, axis2=2).mean(axis=0)).tolist())
+        return np.asarray(np.sqrt(np.diagonal(P, axis1=1, axis2=2).mean(axis=0)))
 
 
 def read_estimate(
@@ -306,9 +301,8 @@ class VehicleAndObjects:
             new.append(NewVariable(OBJECT, name, state, label=label))
         factors: list[Factor] = [*_priors(k, objects.select(~np.isin(objects.id, list(states))))]
         if k == 0:
-            noise = self.settings.odometry
-            deviations = [noise.scale, noise.bias, noise.course]
-            factors.append(prior_factor(error_key(k), np.zeros(ERROR_DIM), np.diag(np.square(deviations))))
+            errors = np.diag(np.square(self.settings.odometry.slow))
+            factors.append(prior_factor(error_key(k), np.zeros(ERROR_DIM), errors))
             factors.append(pose_prior_factor(pose_key(k), pose, _START_NOISE**2 * np.eye(6)))
         if row + 1 == len(self.record):
             factors += odometry(self.record[max(self.known - 1, 0) :], self.settings)
@@ -340,7 +334,7 @@ def estimate_jointly(
     if len(times) != len(odometry) or not np.allclose(times, odometry.timestamps, atol=1e-6):
         raise InputError(f"frames: expected one at each of the {len(odometry)} times of the odometry, got {len(times)}")
     path = odometry.path(start)
-    slow = SlowErrors.at_start(settings)
+    slow = settings.odometry.slow
     estimate = None
     links: list[list[int]] = []
     for _ in range(settings.passes):
@@ -360,7 +354,7 @@ def estimate_jointly(
 def _solve(
     epochs: VehicleAndObjects,
     frames: Sequence[Frame],
-    slow: SlowErrors,
+    slow: FloatArray,
     start_moving: bool,
     providers: Sequence[FactorProvider],
 ) -> JointEstimate:

@@ -89,6 +89,11 @@ class OdometryNoise(Settings):
     course: Positive = setting(0.01, "standard deviation of the course against the sensor axes at the start, rad")
     course_drift: Positive = setting(0.0003, "random walk of that course in one second, rad")
 
+    @property
+    def slow(self) -> FloatArray:
+        """Deviations (3,) of scale, bias (rad/s) and course (rad) at the start, before any measurement."""
+        return np.array([self.scale, self.bias, self.course])
+
     def covariances(self, distance: FloatArray, dt: FloatArray) -> FloatArray:
         """(n, 9, 9) of increments over `distance` (n,) m and `dt` (n,) s > 0.
 
@@ -346,20 +351,6 @@ _ROUNDS = 30  # of expectation maximisation
 ONLINE_STATIONARY_SHARE = 0.1  # prior share of stationary objects online: queues look parked
 
 
-@dataclass(frozen=True)
-class SlowErrors:
-    """Standard deviations of the odometry's scale, its bias of the yaw rate (rad/s) and its course (rad), as known."""
-
-    scale: float
-    bias: float
-    course: float
-
-    @classmethod
-    def at_start(cls, settings: JointSettings) -> SlowErrors:
-        """The deviations of the settings, before any measurement."""
-        return cls(settings.odometry.scale, settings.odometry.bias, settings.odometry.course)
-
-
 @dataclass(frozen=True, eq=False)
 class _PlacedDetections(Columns):
     """All detections, by object and time: object, row of the record, time (N,), place (N, 2), variance, range, u (N,).
@@ -380,9 +371,11 @@ class _PlacedDetections(Columns):
 
 
 def stationary_probabilities(
-    record: Sequence[RecordedEpoch], path: FloatArray, slow: SlowErrors, settings: JointSettings, online: bool = False
+    record: Sequence[RecordedEpoch], path: FloatArray, slow: FloatArray, settings: JointSettings, online: bool = False
 ) -> list[FloatArray]:
     """For each epoch the probabilities (n,) that its objects are stationary; path (K, 4, 4) assumed so far.
+
+    slow: deviations (3,) of the odometry's scale, bias and course, as known
 
     0 where there are too few detections. Between two detections it is the smaller one of theirs.
     """
@@ -403,7 +396,7 @@ def stationary_probabilities(
     return result
 
 
-def _probabilities(seen: _PlacedDetections, slow: SlowErrors, settings: JointSettings, online: bool) -> FloatArray:
+def _probabilities(seen: _PlacedDetections, slow: FloatArray, settings: JointSettings, online: bool) -> FloatArray:
     """P(stationary) (N,) of the object of each detection, around it."""
     n = len(seen.object)
     if n == 0:
@@ -431,8 +424,9 @@ def _probabilities(seen: _PlacedDetections, slow: SlowErrors, settings: JointSet
     between = half(columns, middle, high) - half(columns, low, middle)
     D, (T, s, shift, turn) = between[:, :2], between[:, 2:].T
     S = half(seen.variance, low, high) * (1 / np.maximum(n1, 1) + 1 / np.maximum(n2, 1))
-    S = S + shift + (slow.scale**2 + slow.course**2) * s**2
-    turned = half(seen.range, low, high) ** 2 * (turn + (slow.bias * T) ** 2)
+    scale, bias, course = slow
+    S = S + shift + (scale**2 + course**2) * s**2
+    turned = half(seen.range, low, high) ** 2 * (turn + (bias * T) ** 2)
     sight = half(seen.sight, low, high)
     along = (D * sight).sum(axis=1) ** 2 / np.maximum((sight**2).sum(axis=1), 1e-9)
     d2 = np.stack([along, (D**2).sum(axis=1) - along])  # along the line of sight, and across

@@ -18,7 +18,7 @@ from saga_fg.slam.joint import (
     OdometryNoise,
     estimate_jointly,
 )
-from saga_fg.slam.joint.record import SlowErrors, record_epochs, stationary_probabilities
+from saga_fg.slam.joint.record import record_epochs, stationary_probabilities
 from saga_fg.slam.mapping import LandmarkObservations
 from saga_fg.tracking import AssociationSettings, ClassSettings
 from saga_fg.types import DEFAULT, Observation
@@ -73,8 +73,8 @@ def test_objects_that_stand_correct_the_odometry(solved):
     alone, joint = (off_path(found, poses) for found in (reported.path(poses[0]), estimate.world_T_ego))
     assert estimate.converged
     assert joint.max() < alone.max() / 2
-    assert estimate.errors[-1, 0] == pytest.approx(0.02, abs=3 * estimate.slow_errors.scale)
-    assert estimate.errors[-1, 1] == pytest.approx(-0.004, abs=3 * estimate.slow_errors.bias)
+    assert estimate.errors[-1, 0] == pytest.approx(0.02, abs=3 * estimate.slow_errors[0])
+    assert estimate.errors[-1, 1] == pytest.approx(-0.004, abs=3 * estimate.slow_errors[1])
 
 
 def test_errors_are_as_large_as_the_covariances_say(solved):
@@ -114,14 +114,14 @@ def test_without_objects_or_with_one_seen_once_the_odometry_remains():
     frames, odometry, poses, _ = drive(n=1)
     record = record_epochs(frames, poses, odometry, new_tracker())
     assert all(
-        (p == 0).all() for p in stationary_probabilities(record, poses, SlowErrors(0.01, 0.01, 0.01), JointSettings())
+        (p == 0).all() for p in stationary_probabilities(record, poses, np.array([0.01, 0.01, 0.01]), JointSettings())
     )
 
 
 def test_what_stands_is_told_from_what_drives():
     frames, odometry, poses, cars = drive(parked=4, moving=2)
     record = record_epochs(frames, poses, odometry, new_tracker())
-    p = stationary_probabilities(record, poses, SlowErrors(1e-3, 1e-4, 1e-3), JointSettings())
+    p = stationary_probabilities(record, poses, np.array([1e-3, 1e-4, 1e-3]), JointSettings())
     middle = len(record) // 2
     seen = record[middle].seen
     for name, z in zip(seen.id, seen.z, strict=True):
@@ -140,7 +140,7 @@ def test_who_walks_far_away_does_not_stand():
         boxes = Boxes.of(["pedestrian", "car"], [[20.0 + time, 45.0, 1.0], [20.0, -8.0, 1.0]])
         frames.append(frame_at(time, pose, boxes))
     record = record_epochs(frames, poses, OdometryIncrements.of(t, poses), new_tracker())
-    p = stationary_probabilities(record, poses, SlowErrors.at_start(JointSettings(POOR)), JointSettings(POOR))
+    p = stationary_probabilities(record, poses, POOR.slow, JointSettings(POOR))
     middle = record[len(record) // 2]
     says = dict(zip(middle.objects.label, p[len(record) // 2], strict=True))
     assert says["car"] > 0.9
@@ -161,7 +161,7 @@ def test_a_car_far_away_is_taken_for_parked_only_beside_cars_that_are():
             frames.append(frame_at(time, pose, Boxes.of(["car"] * 7, places)))
         settings = JointSettings(POOR)
         record = record_epochs(frames, poses, OdometryIncrements.of(t, poses), new_tracker())
-        p = stationary_probabilities(record, poses, SlowErrors.at_start(settings), settings)
+        p = stationary_probabilities(record, poses, settings.odometry.slow, settings)
         return float(p[10][np.argmax(np.hypot(*record[10].seen.z[:, :2].T))])
 
     assert far(speed=1.5) < 0.9 < far(speed=0.0)  # below 0.9 no factor holds it in place
@@ -175,7 +175,7 @@ def test_a_queue_that_creeps_does_not_pass_for_parked():
     for time, pose in zip(t, poses, strict=True):
         frames.append(frame_at(time, pose, Boxes.of(["car"] * 2, [[45.0 + 1.2 * time, 0.0, 1.0], [8.0, 6.0, 1.0]])))
     record, settings = record_epochs(frames, poses, OdometryIncrements.of(t, poses), new_tracker()), JointSettings(POOR)
-    slow = SlowErrors.at_start(settings)
+    slow = settings.odometry.slow
     batch, online = (stationary_probabilities(record, poses, slow, settings, online)[-1] for online in (False, True))
     creeps, parked = [int(np.argmin(abs(record[-1].seen.z[:, 1] - y))) for y in (0.0, 6.0)]
     assert batch[creeps] < 0.9
