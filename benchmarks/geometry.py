@@ -196,7 +196,7 @@ def _places(seed: int) -> tuple[list[_Pair], list[FloatArray]]:
     course, result = drive_course(seed)
     pairs, truths = list[_Pair](), list[FloatArray]()
     lidar = course.world_T_ego[result.keyframes] @ course.ego_T_lidar
-    frames = [lidar[one.anchor] @ one.anchor_T_submap for one in result.submaps]
+    frames = [one.frame(lidar) for one in result.submaps]
     middles = [
         transform_points(T, one.points.mean(axis=0)[None])[0] for T, one in zip(frames, result.submaps, strict=True)
     ]

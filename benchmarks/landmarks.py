@@ -51,16 +51,15 @@ from numpy.typing import ArrayLike
 
 from benchmarks.recordings.landmarks import LandmarkLog, read_landmark_log
 from benchmarks.runner import Rows, each
-from data_tools.trajectories import absolute_errors, matched, rigid_alignment
+from data_tools.trajectories import Trajectory, absolute_errors, matched, rigid_alignment
 from factors import PlanarPose, ResidualFactors, Robust, Solution, SolverSettings, prior_factor
-from pipelines.slam.results import planar_trajectory
 from saga_fg.errors import InputError
 from saga_fg.estimators import BatchSolver
 from saga_fg.graph import EGO_ERROR, LANDMARK, Additions, GraphView, NewVariable, SceneFactorGraph, ask_all, key_of
 from saga_fg.model.landmarks import PointLandmark
 from saga_fg.numerics.arrays import FloatArray, IntArray
 from saga_fg.numerics.assignment import gate
-from saga_fg.numerics.geometry import transform_points
+from saga_fg.numerics.geometry import in_space, transform_points
 from saga_fg.slam.mapping import (
     LandmarkObservations,
     LocalMap,
@@ -185,8 +184,8 @@ def compared(drive: LandmarkLog, found: BeaconMap) -> dict[str, float]:
     if drive.truth is None:
         return figures
     tolerance = float(np.diff(drive.time).max(initial=0.01))
-    estimate, truth = matched(planar_trajectory(drive.time, found.world_T_pose), drive.truth, tolerance)
-    reckoned, _ = matched(planar_trajectory(drive.time, found.dead_reckoning), drive.truth, tolerance)
+    estimate, truth = matched(Trajectory(drive.time, in_space(found.world_T_pose)), drive.truth, tolerance)
+    reckoned, _ = matched(Trajectory(drive.time, in_space(found.dead_reckoning)), drive.truth, tolerance)
     figures["ATE, m"] = _root_mean_square(absolute_errors(estimate, truth))
     figures["ATE of dead reckoning, m"] = _root_mean_square(absolute_errors(reckoned, truth))
     known = [number for number in found.beacons if number in drive.places]

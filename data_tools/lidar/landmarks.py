@@ -104,13 +104,11 @@ class Plane:
 
     coefficients  (4,) n and d, d > 0
     covariance    (3, 3) of two tilts of n (rad^2) and of d (m^2); no correlations, the tilts alike
-    centre        (3,) of the visible part, m
     extent        (2, 3) its ends: the lowest point of one end and the highest of the other
     """
 
     coefficients: FloatArray
     covariance: FloatArray
-    centre: FloatArray
     extent: FloatArray
 
 
@@ -127,7 +125,7 @@ def fit_plane(points: FloatArray, noise: float) -> Plane:
     along = off @ vectors[:, 2]
     ends = np.stack([points[along.argmin()], points[along.argmax()]])
     ends[0, 2], ends[1, 2] = points[:, 2].min(), points[:, 2].max()
-    return Plane(np.append(normal, d), covariance, centre, ends)
+    return Plane(np.append(normal, d), covariance, ends)
 
 
 def near_walls(positions: FloatArray, walls: Sequence[Plane], distance: float) -> BoolArray:

@@ -218,9 +218,7 @@ def _rings() -> FloatArray:
 class Submap:
     """A piece of the map.
 
-    number             counts submaps from 0 in the order of the drive
-    keyframes          numbers of its first keyframe and of the one after its last
-    anchor             number of the keyframe that carries the frame
+    keyframes          numbers of its first keyframe, the anchor, which carries the frame, and of the one after its last
     anchor_T_submap    (4, 4) the frame in that of the anchor's sensor, z up
     points             (N, 3) float32, m, in the submap's frame
     way                m driven since the start of the drive, at its first and at its last keyframe
@@ -228,19 +226,18 @@ class Submap:
     Raises `InputError` for points that are not finite.
     """
 
-    number: int
     keyframes: tuple[int, int]
-    anchor: int
     anchor_T_submap: FloatArray
     points: npt.NDArray[np.float32]
     way: tuple[float, float]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "anchor_T_submap", checked("anchor_T_submap", self.anchor_T_submap, (4, 4)))
-        points = np.asarray(self.points, dtype=np.float32)
-        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-            raise InputError(f"points: expected finite coordinates (N, 3), got an array of shape {points.shape}")
-        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "points", checked("points", self.points, (None, 3)).astype(np.float32))
+
+    def frame(self, world_T_keyframe: FloatArray) -> FloatArray:
+        """Its frame in the world (4, 4), given the poses (N, 4, 4) of all keyframes."""
+        return np.asarray(world_T_keyframe[self.keyframes[0]] @ self.anchor_T_submap)
 
 
 def upright(world_T_sensor: FloatArray) -> FloatArray:

@@ -224,19 +224,10 @@ def observability(points: FloatArray, paired: Surfels, normal: FloatArray, weigh
     reach = max(float(np.median(distance)), 1e-3)
     seen = np.hstack([np.cross(p, n) / np.maximum(distance, reach)[:, None], n])
     number, motions = np.linalg.eigh(seen.T @ (w[:, None] * seen))
-    needed = LEAST_SURFELS + float(w @ _squared_roughness(paired.select(first)))
+    spread = np.linalg.eigvalsh(paired.scatter[first])
+    roughness = np.clip(spread[:, 0] / np.maximum(spread[:, 1], 1e-12), 0.0, 1.0)  # rad^2
+    needed = LEAST_SURFELS + float(w @ roughness)
     return Observability(number, needed, motions.T, reach)
-
-
-def _squared_roughness(surfels: Surfels) -> FloatArray:
-    """(M,) rad^2: smallest over second eigenvalue of the scatter, from its trace and its second invariant."""
-    S, n = surfels.scatter, surfels.normal
-    trace = np.trace(S, axis1=1, axis2=2)
-    least = np.einsum("ni,nij,nj->n", n, S, n)
-    second = (trace**2 - np.einsum("nij,nij->n", S, S)) / 2  # sum of the products of two eigenvalues
-    rest, product = trace - least, second - least * (trace - least)
-    middle = (rest - np.sqrt(np.maximum(rest**2 - 4 * product, 0.0))) / 2
-    return np.asarray(np.clip(least / np.maximum(middle, 1e-12), 0.0, 1.0))
 
 
 def _axes(ahead: FloatArray) -> FloatArray:

@@ -38,7 +38,7 @@ import importlib
 import logging
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import ModuleType
@@ -264,14 +264,9 @@ def load_open3d() -> ModuleType:
 
 
 def _preload_libusb() -> None:
-    if not sys.platform.startswith("linux"):
-        return
-    try:
-        path = importlib.import_module("libusb_package").get_library_path()
-    except ImportError:
-        return  # the system may have its own libusb
-    if path is not None:
-        ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+    if sys.platform.startswith("linux"):
+        with suppress(ImportError, OSError):  # the system may have its own libusb
+            ctypes.CDLL(str(importlib.import_module("libusb_package").get_library_path()), mode=ctypes.RTLD_GLOBAL)
 
 
 PERIOD = 0.1  # s between scans of which no time is known
@@ -335,9 +330,8 @@ class ScanRecording:
     clock: Callable[[int], str] | None = None
     timed: bool = True
     dropped: dict[int, int] = field(default_factory=dict)
-    _last: list[int] = field(default_factory=list)  # row that was read
-    _profiles: list[FloatArray] = field(default_factory=list)  # of the rows up to it, one after the other
-    _unlike: list[bool] = field(default_factory=list)  # which are hardly like the one before
+    _profiles: dict[int, FloatArray] = field(default_factory=dict)  # of the rows that were read
+    _unlike: set[int] = field(default_factory=set)  # rows that are hardly like the one before
 
     def __post_init__(self) -> None:
         if not len(self.timestamps):
@@ -380,16 +374,12 @@ class ScanRecording:
         )
 
     def _compare(self, row: int, scan: Scan) -> None:
-        """Raise `InputError` where scans read one after the other are those of two sensors in turn."""
-        if self._last != [row - 1]:
-            self._profiles.clear()
-            self._unlike.clear()
-        self._last[:] = [row]
-        self._profiles.append(_profile(scan.points))
-        if len(self._profiles) > 2:
-            earlier, before, now = self._profiles[-3:]
-            self._unlike.append(_change(before, now) > _UNLIKE * _change(earlier, now))
-        if (count := sum(self._unlike[-_WINDOW:])) >= _IN_TURN:
+        """Raise `InputError` where scans are those of two sensors in turn."""
+        now = self._profiles[row] = _profile(scan.points)
+        earlier, before = (self._profiles.get(row - back) for back in (2, 1))
+        if earlier is not None and before is not None and _change(before, now) > _UNLIKE * _change(earlier, now):
+            self._unlike.add(row)
+        if (count := sum(row - back in self._unlike for back in range(_WINDOW))) >= _IN_TURN:
             raise InputError(
                 f"{self.place(row)}: expected scans of one sensor: {count} of the last {_WINDOW} are far less like the "
                 "scan before than like the one before that, as those of two sensors in turn"

@@ -95,13 +95,13 @@ def sensor_log(
     if unfinished := [name for name, _, path in given if not path]:
         raise InputError(f"--sensor-log: expected SENSOR=FILE, such as imu=imu.csv, got {unfinished[0][:40]!r}")
     known = get_args(SensorName)
-    for option, names in (("--sensors", named), ("--sensor-log", [name for name, _, _ in given])):
-        if unknown := [name for name in names if name not in known]:
-            raise InputError(f"{option}: expected some of {', '.join(known)}, got {unknown[0][:40]!r}")
-    twice = [name for name in known if (*named, *(name for name, _, _ in given)).count(name) > 1]
-    if twice:
-        raise InputError(f"{twice[0]}: expected either --sensors or --sensor-log, once")
-    if not named and not given:
+    both = [*(("--sensors", name) for name in named), *(("--sensor-log", name) for name, _, _ in given)]
+    for row, (option, name) in enumerate(both):
+        if name not in known:
+            raise InputError(f"{option}: expected some of {', '.join(known)}, got {name[:40]!r}")
+        if any(name == other for _, other in both[:row]):
+            raise InputError(f"{name}: expected either --sensors or --sensor-log, once")
+    if not both:
         return None
     place, tables = settings or SensorSettings(), dict[SensorName, FloatArray]()
     recorded = recording.sensors() if named else {}

@@ -1,7 +1,6 @@
-"""A drive: poses of all scans by odometry, and its submaps, which are the map.
+"""A drive: poses of all scans by odometry, and its map as a folder.
 
-Odometry leaves poses of all scans, and motions between them with their covariances. Points of keyframes are collected
-while a submap runs, and thinned to one cloud when it is closed.
+Odometry leaves poses of all scans, and motions between them with their covariances.
 
 The map of a drive as a folder: the points of each submap in a file, and where each lies.
 
@@ -14,22 +13,15 @@ A submap moves as a whole when its place is estimated anew. Any viewer of point 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from data_tools.files import TextTable, read_lines, write_text
-from data_tools.lidar import (
-    Scan,
-    Submap,
-    read_scan,
-    upright,
-    voxel_downsample,
-    write_cloud,
-)
+from data_tools.files import TextTable, read_table, write_text
+from data_tools.lidar import Scan, read_scan, voxel_downsample, write_cloud
+from data_tools.pose_graphs import Record, pose_columns, transforms
 from pipelines.slam.odometry import OdometryStep
 from saga_fg import InputError
 from saga_fg.errors import require_type
@@ -37,8 +29,6 @@ from saga_fg.numerics import (
     FloatArray,
     carried_covariance,
     inverse_transform,
-    quaternion_rotation,
-    rotation_quaternion,
     transform_points,
 )
 
@@ -52,18 +42,22 @@ class Drive:
     covariances  K times (6, 6) of the motion to each scan from the one before: (rotation, translation) in the frame of
                  the later one, rad^2, m^2
     keyframes    rows among the scans
+    closed       whether it has ended
     """
 
     def __init__(self) -> None:
         self.times, self.ways = list[float](), list[float]()
         self.poses, self.covariances = list[FloatArray](), list[FloatArray]()
         self.keyframes = list[int]()
+        self.closed = False
 
     def __len__(self) -> int:
         return len(self.poses)
 
     def check(self, scan: Scan | None, time: float) -> None:
         """Raise `InputError` for what cannot be the next scan."""
+        if self.closed:
+            raise InputError("step: expected no scan after finish; a new one takes the next drive")
         if scan is None:
             raise InputError(
                 "scan: expected one in every step: what sensors measure between scans comes with the next scan, as "
@@ -84,6 +78,12 @@ class Drive:
         covariances = shared(self.poses, step)
         self.covariances[len(self.poses) - len(covariances) :] = covariances
 
+    def close(self) -> None:
+        """End the drive. Raises `InputError` for one that has ended."""
+        if self.closed:
+            raise InputError("finish: expected to be called once")
+        self.closed = True
+
     def moved(self, first: int, last: int | None = None) -> tuple[FloatArray, FloatArray]:
         """The motion (4, 4) from a scan to another, by default the newest, and its covariance (6, 6) at the end."""
         end = len(self.poses) if last is None else last + 1
@@ -97,10 +97,6 @@ class Drive:
         share = (time - self.times[-1]) / (self.times[-1] - self.times[-2])
         pose: FloatArray = last.retract(share * before.localCoordinates(last)).matrix()
         return pose
-
-    def motions(self, rows: Sequence[int]) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the motion (4, 4) from each of these scans to the next, and its covariance (6, 6) at the end."""
-        return [self.moved(a, b) for a, b in pairwise(rows)]
 
     def carried(self, world_T_lidar: FloatArray, rows: Sequence[int] | None = None) -> FloatArray:
         """Return poses (K, 4, 4) of all scans, given some, by default the keyframes: each fixed to the one before,
@@ -139,47 +135,6 @@ def shared(poses: Sequence[FloatArray], step: OdometryStep) -> list[FloatArray]:
     return list(carried_covariance(inverse_transform(them) @ poses[-1], (step.covariance + LEAST) / (lost + 1)))
 
 
-class SubmapBuilder:
-    """Collects the points of the running submap's keyframes.
-
-    spacing: of the points that are kept, m
-    """
-
-    def __init__(self, spacing: float) -> None:
-        self._spacing = spacing
-        self._clouds: list[npt.NDArray[np.float32]] = []
-        self._number, self._first, self._way = 0, 0, 0.0
-        self._driven = 0.0
-        self._anchor_T_submap: FloatArray = np.eye(4)
-
-    def add(self, points: FloatArray, world_T_sensor: FloatArray, driven: float) -> None:
-        """Add the next keyframe: points (N, 3), thinned to the spacing already; driven: way since the last, m."""
-        self._driven += driven
-        if not self._clouds:
-            self._anchor_T_submap, self._way = upright(world_T_sensor), self._driven
-        self._clouds.append(points.astype(np.float32))
-
-    def close(self, world_T_sensor: FloatArray) -> Submap:
-        """Return the submap, given the poses (n, 4, 4) of its keyframes, and begin the next."""
-        inner = inverse_transform(world_T_sensor[0]) @ world_T_sensor
-        frame = inverse_transform(self._anchor_T_submap)
-        points = placed_clouds(self._clouds, frame @ inner, self._spacing).astype(np.float32)
-        last, count = self._first + len(self._clouds), self._number
-        submap = Submap(
-            count, (self._first, last), self._first, self._anchor_T_submap, points, (self._way, self._driven)
-        )
-        self._clouds, self._first, self._number = [], last, count + 1
-        return submap
-
-    def __len__(self) -> int:
-        return len(self._clouds)
-
-
-def world_T_submap(submap: Submap, world_T_anchor: FloatArray) -> FloatArray:
-    """The frame (4, 4) of a submap, given the pose of its anchor."""
-    return np.asarray(world_T_anchor @ submap.anchor_T_submap)
-
-
 def placed_clouds(
     clouds: Sequence[npt.NDArray[np.float32]], poses: Sequence[FloatArray] | FloatArray, spacing: float | None = None
 ) -> FloatArray:
@@ -190,7 +145,6 @@ def placed_clouds(
 
 
 _COLUMNS = ("number", "file", "x", "y", "z", "qx", "qy", "qz", "qw")
-_UNIT = 1e-3  # that the norm of a quaternion may be off 1
 Origin = tuple[float, float, float]
 _ORIGIN = ("latitude [deg]", "longitude [deg]", "altitude [m]")
 
@@ -217,11 +171,10 @@ class SlamMap:
 def write_map(folder: Path, slam_map: SlamMap) -> None:
     """Write a map to a folder that exists."""
     rows = [",".join(_COLUMNS)]
-    for number, (points, pose) in enumerate(zip(slam_map.points, slam_map.map_T_submap, strict=True)):
+    for number, (points, pose) in enumerate(zip(slam_map.points, pose_columns(slam_map.map_T_submap), strict=True)):
         name = f"{number:04d}.ply"
         write_cloud(folder / name, points.astype(np.float64))
-        w, x, y, z = rotation_quaternion(pose[:3, :3])
-        rows.append(",".join([str(number), name, *(f"{value:.9f}" for value in (*pose[:3, 3], x, y, z, w))]))
+        rows.append(",".join([str(number), name, *(f"{value:.9f}" for value in pose)]))
     write_text(folder / "submaps.csv", "\n".join(rows) + "\n")
     if slam_map.origin is not None:
         numbers = ",".join(f"{value:.12g}" for value in slam_map.origin)
@@ -237,34 +190,27 @@ def read_map(folder: str | Path) -> SlamMap:
         raise InputError(
             f"{folder}: expected a map: a folder with submaps.csv and a file of points for each of its lines"
         )
-    lines = [(number, line.split(",")) for number, line in enumerate(read_lines(path), start=1) if line.strip()]
-    if not lines or tuple(lines[0][1]) != _COLUMNS:
-        raise InputError(f"{path}: line 1: expected the columns {','.join(_COLUMNS)}")
-    for number, row in lines[1:]:
-        if len(row) != len(_COLUMNS):
-            raise InputError(f"{path}: line {number}: expected {len(_COLUMNS)} columns, got {len(row)}")
-    table = TextTable.from_rows(path, [row for _, row in lines[1:]], [number for number, _ in lines[1:]], len(_COLUMNS))
-    numbers = table.numbers(slice(2, 9), _COLUMNS[2:])
-    poses = np.tile(np.eye(4), (len(table), 1, 1))
-    off = np.abs(np.linalg.norm(numbers[:, 3:], axis=1) - 1)
-    if (off > _UNIT).any():
-        raise table.fault(int(np.argmax(off > _UNIT)), "expected a quaternion qx, qy, qz, qw of length 1")
-    poses[:, :3, :3] = quaternion_rotation(numbers[:, [6, 3, 4, 5]])
-    poses[:, :3, 3] = numbers[:, :3]
-    points = []
-    for at, name in enumerate(table.values[:, 1].tolist()):
-        if Path(name).name != name:
-            raise table.fault(at, f"file: expected a file beside {path.name}, got {name[:40]!r}")
-        points.append(read_scan(folder / name).points.astype(np.float32))
+    table = _rows_below(path, _COLUMNS)
+    poses, names = transforms(table, Record(3, _COLUMNS[:2], _COLUMNS[2:])), table.values[:, 1].tolist()
+    beside = np.array([Path(name).name == name for name in names], dtype=np.bool_)
+    table.check(beside, lambda row: f"file: expected a file beside {path.name}, got {names[row][:40]!r}")
+    points = [read_scan(folder / name).points.astype(np.float32) for name in names]
     return SlamMap(points, poses, _read_origin(folder / "origin.csv"))
+
+
+def _rows_below(path: Path, columns: tuple[str, ...]) -> TextTable:
+    """The rows of a table below the line of its columns. Raises `InputError` for other columns."""
+    table = read_table(path, (len(columns),), ",".join(columns), ",")
+    if not len(table) or tuple(table.values[0]) != columns:
+        raise InputError(f"{path}: line 1: expected the columns {','.join(columns)}")
+    return TextTable(path, table.values[1:], table.line[1:])
 
 
 def _read_origin(path: Path) -> Origin | None:
     if not path.is_file():
         return None
-    lines = [line.split(",") for line in read_lines(path) if line.strip()]
-    if len(lines) != 2 or tuple(lines[0]) != _ORIGIN or len(lines[1]) != len(_ORIGIN):
-        raise InputError(f"{path}: expected a line of columns, {','.join(_ORIGIN)}, and a line of numbers")
-    table = TextTable.from_rows(path, lines[1:], [2])
+    table = _rows_below(path, _ORIGIN)
+    if len(table) != 1:
+        raise InputError(f"{path}: expected one line of numbers, got {len(table)}")
     latitude, longitude, altitude = table.numbers(slice(0, 3), _ORIGIN, (85.0, 180.0, 1e5))[0].tolist()
     return latitude, longitude, altitude

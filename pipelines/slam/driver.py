@@ -30,19 +30,18 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import ndtr
 
-from data_tools.lidar import Scan, Submap, inside_boxes, voxel_downsample, without_objects
+from data_tools.lidar import Scan, Submap, inside_boxes, without_objects
 from data_tools.trajectories import Trajectory
-from pipelines.slam.drive import Drive, SubmapBuilder, moved_pose, world_T_submap
-from pipelines.slam.loop_closures import ClosedSubmaps, LoopSearch
+from pipelines.slam.drive import Drive, moved_pose
+from pipelines.slam.loop_closures import LoopSearch, Submaps
 from pipelines.slam.odometry import Odometry, OdometryStep
 from pipelines.slam.vehicle_sensors import Vehicle, VehicleSensors
 from saga_fg import InputError, Tracker
 from saga_fg.graph import FactorProvider
 from saga_fg.numerics import FloatArray, IntArray, checked_transform
 from saga_fg.slam.joint import JointEstimate
-from saga_fg.slam.mapping import AssociatedObservation
 from saga_fg.slam.pose_graph import PoseGraph, PosePriors
-from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph, SubmapSettings
+from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph, SubmapSettings, drive_graph
 from saga_fg.types import (
     Boxes,
     Detections,
@@ -87,7 +86,7 @@ class SlamResult:
                    when the scan came
     covariances    (M, 6, 6) of the keyframes' poses, (rotation, translation) in the sensor's frame, rad^2, m^2
     landmarks      of the map, those seen more than once
-    observations   of landmarks, with the landmark and the keyframe of each
+    observations   (M) of each keyframe, with the number of the landmark
     loops          that were closed and agree with each other, between keyframes
     false_loops    those that do not, and are left out of the solution
     selection      how loops were chosen, and deviations of odometry to those stated, as they demand
@@ -107,7 +106,7 @@ class SlamResult:
     online: Trajectory
     covariances: FloatArray
     landmarks: Sequence[Landmark]
-    observations: Sequence[AssociatedObservation]
+    observations: Sequence[Sequence[tuple[int, Observation]]]
     loops: Sequence[LoopClosure]
     false_loops: Sequence[LoopClosure]
     selection: LoopSelection
@@ -122,8 +121,10 @@ class SlamResult:
     alone: Trajectory | None = None
 
     def motions(self, rows: Sequence[int]) -> list[tuple[FloatArray, FloatArray]]:
-        """Motions (4, 4) between scans by odometry, as `Drive.motions`, with the covariances of the solution."""
-        return [(T, self.selection.inflated(P)) for T, P in self.drive.motions(rows)]
+        """Motions (4, 4) from each of these scans to the next by odometry, and their covariances (6, 6) at the end, as
+        in the solution."""
+        moved = (self.drive.moved(a, b) for a, b in pairwise(rows))
+        return [(T, self.selection.inflated(P)) for T, P in moved]
 
     @property
     def keyframes(self) -> IntArray:
@@ -132,21 +133,8 @@ class SlamResult:
 
     def pose_graph(self) -> PoseGraph:
         """Keyframes 0 .. M - 1 with the odometry between them and the loops."""
-        odometry = self.motions(self.drive.keyframes)
-        pairs = [*pairwise(range(len(odometry) + 1)), *((loop.first, loop.second) for loop in self.loops)]
-        first, second = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
-        measured = [*(T for T, _ in odometry), *(loop.first_T_second for loop in self.loops)]
-        covariances = np.array([*(P for _, P in odometry), *(loop.covariance for loop in self.loops)])
-        information = np.linalg.inv(covariances.reshape(-1, 6, 6))
-        return PoseGraph(
-            np.arange(len(odometry) + 1, dtype=np.int64),
-            self.world_T_lidar,
-            first,
-            second,
-            np.array(measured).reshape(-1, 4, 4),
-            (information + information.swapaxes(1, 2)) / 2,
-            priors=PosePriors(np.zeros(1, dtype=np.int64), self.drive.poses[0][None], np.linalg.inv(START)[None]),
-        )
+        first = PosePriors(np.zeros(1, dtype=np.int64), self.drive.poses[0][None], np.linalg.inv(START)[None])
+        return drive_graph(self.motions(self.drive.keyframes), self.loops, first).at(self.world_T_lidar)
 
 
 _SPEED = 1.0  # m/s, from which an object moves
@@ -238,20 +226,14 @@ class Slam:
         self._first: FloatArray = first
         self._start = np.eye(4) if pose is None else checked_transform("start", pose)
         self._sensors, self._moving = VehicleSensors(vehicle or Vehicle(), bool(providers)), moving
-        self._measured, self._others = self._sensors.since_keyframe, bool(providers)
+        self._others = bool(providers)
         both = [*self._sensors.new_providers(), *providers]
         self._new_graph = partial(SubmapGraph, settings=front_end.submaps, providers=both)
         self._graph = self._new_graph(self._start, self._first)
-        self._closed = ClosedSubmaps(front_end.loops)
-        self._builder = SubmapBuilder(front_end.spacing)
+        self._submaps = Submaps(front_end.spacing, front_end.loops)
         self._path, self._online = Drive(), list[FloatArray]()
         self._degenerate, self._boxes = list[tuple[str, ...]](), list[Boxes]()  # of all scans
-        self._finished, self._covariance = False, self._first  # of the last keyframe's pose
-
-    @property
-    def graph(self) -> SubmapGraph:
-        """The running graph. To be read, not changed."""
-        return self._graph
+        self._covariance = self._first  # of the last keyframe's pose
 
     def step(
         self,
@@ -271,11 +253,9 @@ class Slam:
         measurement or detections that nothing reads, and after `finish`. A later scan without points lies where it was
         predicted, with the deviation that the settings say, until one is registered again.
         """
-        if self._finished:
-            raise InputError("step: expected no scan after finish; a new one takes the next drive")
         self._path.check(scan, time)
         measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
-        self._measured.check(measured)
+        self._sensors.check(measured)
         if detections is not None and self._moving is None and not self._others:
             raise InputError("detections: expected with `moving`, or with providers that read them")
         moving = Boxes.empty()
@@ -290,30 +270,26 @@ class Slam:
         self._boxes.append(moving)
         self._path.add(time, self._start @ placed.map_T_lidar, placed)
         self._online.append(self._path.poses[-1])
-        row, submap, known = len(self._path) - 1, None, len(self._closed.loops)
+        row, submap, known = len(self._path) - 1, None, len(self._submaps.loops)
         if placed.keyframe:
             submap = self._add_keyframe(row, placed, detections)
         since = self._path.moved(self._path.keyframes[-1])
         self._online[-1], now = moved_pose(self._graph.pose(len(self._graph) - 1), self._covariance, since)
         number = len(self._path.keyframes) - 1 if placed.keyframe else None
-        return SlamStep(self._online[-1], now, placed, number, submap, tuple(self._closed.loops[known:]))
+        return SlamStep(self._online[-1], now, placed, number, submap, tuple(self._submaps.loops[known:]))
 
     def finish(self) -> SlamResult:
         """Close the last submap, and solve everything together."""
-        if self._finished:
-            raise InputError("finish: expected to be called once")
         if not self._path.keyframes:
             raise InputError("expected at least one scan before the end, and a keyframe")
-        if len(self._builder):
-            self._closed.close(self._builder, self._graph, self._graph.poses())
+        self._path.close()
+        self._submaps.close(self._graph, self._graph.poses())
         solved = self._graph.finish()
-        self._finished = True
         fit = self._sensors.consistency
         fit.observe(solved.graph)
         fit.warn()
         drive = self._path
-        submaps, (true_loops, false_loops) = self._closed.submaps, self._closed.judged(solved.loops)
-        anchors = solved.world_T_pose[[submap.anchor for submap in submaps]]
+        submaps, (true_loops, false_loops) = self._submaps.closed, self._submaps.judged(solved.loops)
         times, lidar_T_ego = np.array(self._path.times), self._sensors.lidar_T_ego
         return SlamResult(
             drive,
@@ -322,7 +298,7 @@ class Slam:
             Trajectory(times, np.array(self._online) @ lidar_T_ego),
             solved.covariances,
             solved.landmarks,
-            self._graph.observations(),
+            self._graph.seen,
             true_loops,
             false_loops,
             solved.loops,
@@ -331,7 +307,7 @@ class Slam:
             fit.misfits,
             fit.unjudged,
             submaps,
-            np.array([world_T_submap(*each) for each in zip(submaps, anchors, strict=True)]),
+            np.array([submap.frame(solved.world_T_pose) for submap in submaps]),
             solved.world_T_pose,
         )
 
@@ -343,14 +319,14 @@ class Slam:
             moved = self._path.moved(self._path.keyframes[-1])
         elif row:  # a detector or provider raised at the scans before
             self._graph = self._new_graph(self._path.poses[row], self._first + self._path.moved(0)[1])
-        frame = self._measured.frame(self._path.times[row], detections)
+        frame = self._sensors.frame(self._path.times[row], detections)
         closes = self._graph.append(self._path.times[row], moved, seen, frame)
-        self._measured.clear()
+        self._sensors.taken()
         self._sensors.begin(self._graph.smoother)
         self._path.keyframes.append(row)
-        submap = self._closed.close(self._builder, self._graph, self._graph.poses()[:-1]) if closes else None
+        submap = self._submaps.close(self._graph, self._graph.poses()[:-1]) if closes else None
         pose = self._graph.pose(len(self._graph) - 1)
         driven = 0.0 if moved is None else float(np.linalg.norm(moved[0][:3, 3]))
-        self._builder.add(points[voxel_downsample(points, self._front_end.spacing)], pose, driven)
+        self._submaps.add(points, pose, driven)
         self._covariance = self._graph.covariance()
         return submap

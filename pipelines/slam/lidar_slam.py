@@ -21,7 +21,6 @@ from data_tools.lidar import ScanSequence, extract_poles, extract_walls, scan_co
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
-from pipelines.slam.drive import world_T_submap
 from pipelines.slam.driver import FrontEnd, MovingObjects, Slam, SlamResult
 from pipelines.slam.loop_closures import LoopSearch, LoopSettings, PlaceLoops
 from pipelines.slam.odometry import LidarOdometry, Odometry, OdometrySettings
@@ -174,10 +173,8 @@ def known_providers(
 ) -> tuple[LandmarkObservations, Loops]:
     """Providers of landmarks seen from keyframes and of loops between these, whose poses are those of `epochs`."""
     start = {mark.number: mark.state for mark in result.landmarks}
-    seen: dict[int, list[tuple[int, Observation]]] = {}
-    for one in result.observations:
-        if one.landmark in start:
-            seen.setdefault(epochs[one.pose], []).append((one.landmark, one.observation))
+    known = ([(n, one) for n, one in now if n in start] for now in result.observations)
+    seen = {epoch: now for epoch, now in zip(epochs, known, strict=True) if now}
     return LandmarkObservations(seen, start, settings.robust), Loops(result.loops, epochs)
 
 
@@ -245,7 +242,7 @@ def with_objects(
         trajectory=Trajectory(scans.timestamps, poses),
         covariances=estimate.pose_covariances[at],
         landmarks=known[0].landmarks(estimate.solution, s.submaps.confirm_after),
-        world_T_submap=np.array([world_T_submap(one, placed[one.anchor]) for one in result.submaps]),
+        world_T_submap=np.array([submap.frame(placed) for submap in result.submaps]),
         world_T_lidar=placed,
         objects=estimate,
         alone=result.trajectory,

@@ -47,7 +47,7 @@ from pipelines.tracking import Progress
 from saga_fg import InputError
 from saga_fg.errors import require_type
 from saga_fg.estimators import IncrementalSmoother
-from saga_fg.graph import EGO_POSE, Additions, FactorProvider
+from saga_fg.graph import Additions, FactorProvider
 from saga_fg.numerics import (
     BoolArray,
     FloatArray,
@@ -92,8 +92,9 @@ class KnownMap:
 
         near: a place (2,) or (3,) in the map; places farther than the radius from it are left out
         """
-        self.ambiguous, frames, older = False, self._map.map_T_submap, None
+        frames, older = self._map.map_T_submap, None
         if len(query) < FEWEST:
+            self.ambiguous = False
             return None
         if not len(self._index):
             for number, cloud in enumerate(self._map.points):
@@ -102,24 +103,19 @@ class KnownMap:
         if near is not None:
             older = np.flatnonzero(np.linalg.norm(frames[:, :2, 3] - near[:2], axis=1) <= RADIUS).tolist()
         mine, points = Structure.of(query), query[voxel_downsample(query, SCAN_SPACING)]
-        found, otherwise = list[tuple[float, FloatArray]](), False
+        sure, fitting = list[tuple[float, FloatArray]](), 0
         for match in self._index.candidates(PlaceImage.of(query), older, COMPARED)[:_REGISTERED]:
             around = self.around(frames[match.number][:3, 3])
             fine = registered(around, points, frames[match.number] @ match.place_T_query)
-            overlap = 0.0 if fine is None else Structure.of(around).shared(mine, fine.map_T_scan)
-            if fine is not None and overlap > MIN_OVERLAP:
-                if fits_otherwise(match):
-                    otherwise = True
-                else:
-                    found.append((overlap, fine.map_T_scan))
-        if not found:
-            self.ambiguous = otherwise
-            return None
-        found.sort(key=lambda one: -one[0])
-        places = np.array([map_T_query for _, map_T_query in found])
-        agreed = agreeing(places[:, :3, 3], np.array([overlap for overlap, _ in found]))
-        self.ambiguous = not agreed
-        return places[0] if agreed else None
+            if fine is not None and (overlap := Structure.of(around).shared(mine, fine.map_T_scan)) > MIN_OVERLAP:
+                fitting += 1
+                if not fits_otherwise(match):
+                    sure.append((overlap, fine.map_T_scan))
+        sure.sort(key=lambda one: -one[0])
+        places = np.array([map_T_query[:3, 3] for _, map_T_query in sure])
+        agreed = agreeing(places, np.array([overlap for overlap, _ in sure])) if sure else []
+        self.ambiguous = fitting > 0 and not agreed
+        return sure[0][1] if agreed else None
 
     def registered(self, points: FloatArray, predicted: FloatArray, rough: bool) -> Registration | None:
         """The registration of a scan (N, 3) with the map, None where it does not fit.
@@ -216,8 +212,7 @@ class Localiser:
         self._odometry = LidarOdometry(self.settings.odometry)
         self._guess = None if guess is None else checked_transform("guess", guess)
         self._sensors = VehicleSensors(vehicle or Vehicle())
-        self._measured, self._of_sensors = self._sensors.since_keyframe, self._sensors.new_providers()
-        self._consistency = self._sensors.consistency
+        self._of_sensors, self._consistency = self._sensors.new_providers(), self._sensors.consistency
         self._fix: tuple[float, float, FloatArray] | None = None  # the newest: its time, s, the way then, m, its place
         self._map = KnownMap(slam_map)
         self._path = Drive()
@@ -228,9 +223,8 @@ class Localiser:
         self._clouds: list[tuple[int, FloatArray]] = []  # of the last keyframes, thinned, with their rows
         self._searched, self._proved = 0.0, 0.0  # m, way of the last search, and of the last comparison
         self._smoother: IncrementalSmoother | None = None
-        self._last, self._time, self._fitted = 0, 0.0, 0.0  # keyframe in the graph, time of it; way of the last fit, m
+        self._last, self._fitted = 0, 0.0  # keyframe in the graph; way of the last fit, m
         self._pose, self._covariance = np.eye(4), _GUESSED  # of that keyframe
-        self._finished = False
 
     def step(
         self,
@@ -244,11 +238,9 @@ class Localiser:
 
         Raises `InputError` as that, too.
         """
-        if self._finished:
-            raise InputError("step: expected no scan after finish; a new Localiser takes the next drive")
         self._path.check(scan, time)
         measured = EgoMeasurements(gps=gps, imu=imu, wheels=wheels)
-        self._measured.check(measured)
+        self._sensors.check(measured)
         placed = self._sensors.placed(self._odometry, scan, time, measured)
         self._path.add(time, placed.map_T_lidar, placed)
         row = len(self._path) - 1
@@ -256,13 +248,12 @@ class Localiser:
             self._fix = time - gps.age, self.way, gps.position
         points = placed.scan.points
         if placed.keyframe:
-            self._time = time
             self._clouds.append((row, points[voxel_downsample(points, 0.5)] if len(points) else points))
             if self._smoother is None:
-                self._look_for(row, points, time)
+                self._look_for(row, points)
             if self._smoother is not None and self._last != row:
-                self._add(row, points, time)
-            self._measured.clear()
+                self._add(row, points)
+            self._sensors.taken()
         if self._smoother is None:
             return LocalisedStep(None, None, False)
         now = moved_pose(self._pose, self._covariance, self._path.moved(self._last))
@@ -293,14 +284,12 @@ class Localiser:
 
         None if no place has been found.
         """
-        if self._finished:
-            raise InputError("finish: expected to be called once")
-        self._finished = True
+        self._path.close()
         if self._smoother is not None:
             self._consistency.observe(self._smoother.graph())
             self._compare()
         if self._smoother is None and self._clouds and self.way > self._searched:
-            self._search(*self._clouds[-1], self._time)
+            self._search(*self._clouds[-1])
         if (path := self.path()) is None:
             return None
         self._consistency.warn()
@@ -322,19 +311,19 @@ class Localiser:
                 found.append(carried_covariance(ahead, covariance + noise))
         return np.array(found)
 
-    def _look_for(self, row: int, points: FloatArray, time: float) -> None:
+    def _look_for(self, row: int, points: FloatArray) -> None:
         """Begin the graph where the guess says, or at a place that the points since the last search resemble."""
         if self._guess is not None:
             guess, self._guess = self._guess, None
             self._begin(guess @ inverse_transform(self._path.poses[0]) @ self._path.poses[row])
-            if self._add(row, points, time):
+            if self._add(row, points):
                 self._compare()
             else:
                 self._give_up("the first scan does not fit the map at the guess")
         elif self.way - self._searched >= self.settings.search_way:
-            self._search(row, points, time)
+            self._search(row, points)
 
-    def _search(self, row: int, points: FloatArray, time: float) -> None:
+    def _search(self, row: int, points: FloatArray) -> None:
         """Look for the points of the last keyframes in the map, and begin there."""
         query, frame = self._seen()
         thin = query[voxel_downsample(query, 0.5)]
@@ -347,14 +336,15 @@ class Localiser:
             self._clouds = self._clouds[len(self._clouds) // 2 :]
         else:
             self._begin(map_T_frame @ inverse_transform(frame) @ self._path.poses[row])
-            self._add(row, points, time)
+            self._add(row, points)
 
     def _fix_nearby(self) -> FloatArray | None:
         """The newest fix (2,) or (3,) by GPS, None once the vehicle may have left its surroundings."""
         if self._fix is None:
             return None
         time, way, place = self._fix
-        return place if self._time - time <= _FIX_AGE and self.way - way <= RADIUS / 2 else None
+        age = self._path.times[self._clouds[-1][0]] - time
+        return place if age <= _FIX_AGE and self.way - way <= RADIUS / 2 else None
 
     def _seen(self) -> tuple[FloatArray, FloatArray]:
         """Points (N, 3) of the last keyframes, level, and their frame (4, 4) by odometry."""
@@ -392,35 +382,26 @@ class Localiser:
         self._unproved, self._smoother = [], None
         self._searched = self._path.ways[self._clouds[0][0]]
 
-    def _add(self, row: int, points: FloatArray, time: float) -> bool:
+    def _add(self, row: int, points: FloatArray) -> bool:
         """Add a keyframe to the graph, registered with the map where it fits; returns whether it does."""
         assert self._smoother is not None
-        s, first = self.settings, self._smoother.graph().epoch < 0
-        if first:
-            measured = MeasuredMotion(self._pose, _GUESSED)
-            predicted = self._pose
-        else:
-            since = self._path.moved(self._last, row)
-            predicted = self._pose @ since[0]
-            measured = MeasuredMotion(*since)
-        found = self._map.registered(points, predicted, first)
-        given: list[FactorProvider] = [measured]
+        s, epoch = self.settings, self._smoother.graph().epoch + 1
+        since = self._path.moved(self._last, row) if epoch else (self._pose, _GUESSED)
+        predicted, key = self._pose @ since[0] if epoch else self._pose, pose_key(epoch)
+        found = self._map.registered(points, predicted, not epoch)
+        given: list[FactorProvider] = [MeasuredMotion(*since)]
         if found is not None:
             lost = found.observed.lost / found.observed.scale
             covariance = found.covariance + _ACCURACY + LOST_TRANSLATION**2 * lost.T @ lost
-            key = pose_key(self._smoother.graph().epoch + 1)
             seen = pose_prior_factor(key, found.map_T_scan, covariance, Robust("cauchy", ROBUST_SCALE))
             given.append(Given(Additions(factors=[seen]), "map"))
             self._fitted = self.way
             self._fits.add(row)
-        self._smoother.step(time, [*given, *self._of_sensors], self._measured.frame(time, None))
+        time = self._path.times[row]
+        self._smoother.step(time, [*given, *self._of_sensors], self._sensors.frame(time))
         self._sensors.begin(self._smoother)
         self._consistency.observe(self._smoother.graph(), s.lag / 2)
-        (pose,) = self._smoother.graph().of(EGO_POSE, self._smoother.graph().epoch).values()
-        self._pose, self._covariance = (
-            self._smoother.graph().state(pose.key).matrix(),
-            self._smoother.covariance(pose.key),
-        )
+        self._pose, self._covariance = self._smoother.graph().state(key).matrix(), self._smoother.covariance(key)
         self._last = row
         self._found[row] = self._pose, self._covariance
         self._unproved.append(row)

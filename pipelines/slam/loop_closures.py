@@ -33,6 +33,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from data_tools.lidar import (
     PlaceImage,
@@ -45,9 +46,11 @@ from data_tools.lidar import (
     SurfelMap,
     Undetermined,
     register,
+    upright,
     voxel_downsample,
 )
-from pipelines.slam.drive import LEAST, SubmapBuilder, world_T_submap
+from data_tools.trajectories import rotation_angle
+from pipelines.slam.drive import LEAST, placed_clouds
 from saga_fg.numerics import FloatArray, IntArray, carried_covariance, inverse_transform
 from saga_fg.settings import Fraction, Positive, Settings, setting
 from saga_fg.slam.pose_graph.optimisation import shortest_paths
@@ -56,8 +59,7 @@ from saga_fg.slam.submaps import LoopClosure, LoopSelection, SubmapGraph
 
 def deviation(T: FloatArray) -> FloatArray:
     """Translation, m, and rotation, rad, (2,) of a transform (4, 4)."""
-    turned = float(np.linalg.norm(T[:3, :3] - np.eye(3))) / (2 * np.sqrt(2))  # sin of half the angle
-    return np.array([float(np.linalg.norm(T[:3, 3])), 2 * np.arcsin(min(turned, 1.0))])
+    return np.array([np.linalg.norm(T[:3, 3]), rotation_angle(T[:3, :3])])
 
 
 @dataclass(eq=False)
@@ -83,20 +85,15 @@ class Agreement:
         between: pose of the second in the frame of the first, by odometry; way: driven until a pose, m
         """
         now = way(loop.second)
-        agreed = list[LoopClosure]()
-        self._waiting = [k for k in self._waiting if way(k.second) > now - self.patience]
-        for other in self._waiting:
+        agreed, waiting = list[LoopClosure](), list[LoopClosure]()
+        for other in (each for each in self._waiting if way(each.second) > now - self.patience):
             far = abs(way(loop.first) - way(other.first)) + abs(now - way(other.second))
             one = between(other.first, loop.first) @ loop.first_T_second
             off = deviation(np.linalg.inv(one) @ other.first_T_second @ between(other.second, loop.second))
-            if now - way(other.second) >= self.apart and (off < self.within + self.drift * far).all():
-                agreed.append(other)
-        held = {id(other) for other in agreed}
-        self._waiting = [k for k in self._waiting if id(k) not in held]
-        if not agreed:
-            self._waiting.append(loop)
-            return []
-        return [loop, *agreed]
+            fits = now - way(other.second) >= self.apart and (off < self.within + self.drift * far).all()
+            (agreed if fits else waiting).append(other)
+        self._waiting = waiting if agreed else [*waiting, loop]
+        return [loop, *agreed] if agreed else []
 
 
 FEWEST = 200  # points of a submap that shows a place
@@ -164,12 +161,11 @@ class LoopSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class _Proved:
-    """A loop with the structure that both ends share, its distance from the estimate, and the way between them, m."""
+    """A loop with the structure that both ends share, and how far it is off the estimate, by the drift of odometry."""
 
     loop: LoopClosure
     overlap: float
-    off: float
-    way: float
+    drift: float
 
 
 class LoopSearch(ABC):
@@ -249,9 +245,9 @@ class PlaceLoops(LoopSearch):
         self._index.add(number, image)
         believed = list[tuple[LoopClosure, bool]]()
         for one in proved[:_TAKEN]:
-            if self._trusted(one):
+            if one.drift < 1:
                 believed.append((one.loop, False))
-            elif one.overlap >= _ALONE and self._trusted(one, 2.0):
+            elif one.overlap >= _ALONE and one.drift < 2:
                 believed.append((replace(one.loop, confirmed=True), False))
             elif one.overlap >= _SURELY:
                 believed.append((one.loop, True))
@@ -271,9 +267,10 @@ class PlaceLoops(LoopSearch):
                 continue
             loop, overlap = self._registered(match, number)
             if loop is not None and overlap >= self.settings.min_overlap:
-                off = _off(frames, loop)
+                there = frames[loop.first] @ loop.first_T_second
+                off = float(np.linalg.norm(there[:3, 3] - frames[number, :3, 3]))
                 if off < self._farthest(way[match.number]):
-                    found.append(_Proved(loop, overlap, off, float(way[match.number])))
+                    found.append(_Proved(loop, overlap, (off - 1.0) / (self.settings.drift * way[match.number])))
         return self._unrivalled(found, frames)
 
     def _registered(self, match: PlaceMatch, number: int) -> tuple[LoopClosure | None, float]:
@@ -292,7 +289,7 @@ class PlaceLoops(LoopSearch):
         """The loops that agree with the best one; none if another one is nearly as good and says otherwise."""
         if not found:
             return []
-        trusted = [one for one in found if self._trusted(one)]
+        trusted = [one for one in found if one.drift < 1]
         found = sorted(trusted or found, key=lambda one: -one.overlap)
         first = found[0].loop.first
         ways = np.array([abs(self._submaps[one.loop.first].way[1] - self._submaps[first].way[1]) for one in found])
@@ -300,40 +297,49 @@ class PlaceLoops(LoopSearch):
         overlap = np.array([one.overlap for one in found])
         return [found[k] for k in agreeing(places, overlap, SAME + self.settings.drift * ways)]
 
-    def _trusted(self, one: _Proved, times: float = 1.0) -> bool:
-        """True if the loop deviates from odometry by no more than its drift, or so many times of it."""
-        return one.off < 1.0 + times * self.settings.drift * one.way
-
     @staticmethod
     def _farthest(way: FloatArray) -> FloatArray:
         return _FARTHEST[0] + _FARTHEST[1] * way
 
 
-def _off(frames: FloatArray, loop: LoopClosure) -> float:
-    """Distance of where a loop says that the submap is from where it is estimated, m."""
-    found = frames[loop.first] @ loop.first_T_second
-    return float(np.linalg.norm(found[:3, 3] - frames[loop.second, :3, 3]))
-
-
 _LOG = logging.getLogger(__name__)
 
 
-class ClosedSubmaps:
-    """The submaps of a drive so far; search: for loops between them, None for none."""
+class Submaps:
+    """The submaps of a drive: the running one, whose points are collected, those closed, and the loops between them.
 
-    def __init__(self, search: LoopSearch | None) -> None:
-        self.submaps, self.loops = list[Submap](), list[LoopClosure]()  # loops are between keyframes
-        self._search = search
+    spacing: of the points that are kept, m; search: for loops, None for none
+    """
 
-    def close(self, builder: SubmapBuilder, graph: SubmapGraph, poses: FloatArray) -> Submap:
-        """Close the running submap, poses (n, 4, 4) of all keyframes up to its last."""
-        submap = builder.close(poses[-len(builder) :])
-        self.submaps.append(submap)
+    def __init__(self, spacing: float, search: LoopSearch | None) -> None:
+        self.closed, self.loops = list[Submap](), list[LoopClosure]()  # loops are between keyframes
+        self._spacing, self._search = spacing, search
+        self._clouds: list[npt.NDArray[np.float32]] = []  # of the running submap's keyframes
+        self._way, self._begin, self._anchor_T_submap = 0.0, 0.0, np.eye(4)  # m; the way where it began, and its frame
+
+    def add(self, points: FloatArray, world_T_sensor: FloatArray, driven: float) -> None:
+        """Add the points (N, 3) of the next keyframe; driven: way since the last, m."""
+        self._way += driven
+        if not self._clouds:
+            self._anchor_T_submap, self._begin = upright(world_T_sensor), self._way
+        self._clouds.append(points[voxel_downsample(points, self._spacing)].astype(np.float32))
+
+    def close(self, graph: SubmapGraph, poses: FloatArray) -> Submap | None:
+        """Close the running submap, poses (n, 4, 4) of all keyframes up to its last; None if nothing runs."""
+        if not self._clouds:
+            return None
+        anchor = len(poses) - len(self._clouds)
+        inner = inverse_transform(poses[anchor]) @ poses[anchor:]
+        points = placed_clouds(self._clouds, inverse_transform(self._anchor_T_submap) @ inner, self._spacing)
+        way = (self._begin, self._way)
+        submap = Submap((anchor, len(poses)), self._anchor_T_submap, points.astype(np.float32), way)
+        self.closed.append(submap)
+        self._clouds = []
         if self._search is not None:
-            frames = np.array([world_T_submap(one, poses[one.anchor]) for one in self.submaps])
+            frames = np.array([one.frame(poses) for one in self.closed])
             found = [self._between_anchors(loop) for loop in self._search.add(submap, frames)]
             graph.close_loops(found)
-            anchors = [one.anchor for one in self.submaps]
+            anchors = [one.keyframes[0] for one in self.closed]
             self.loops += [replace(one, first=anchors[one.first], second=anchors[one.second]) for one in found]
         return submap
 
@@ -347,7 +353,7 @@ class ClosedSubmaps:
 
     def _between_anchors(self, loop: LoopClosure) -> LoopClosure:
         """A loop between frames of submaps as one between their anchors."""
-        first, second = (self.submaps[n].anchor_T_submap for n in (loop.first, loop.second))
+        first, second = (self.closed[n].anchor_T_submap for n in (loop.first, loop.second))
         covariance = carried_covariance(second, loop.covariance) + LEAST
         moved = first @ loop.first_T_second @ inverse_transform(second)
         return replace(loop, first_T_second=moved, covariance=covariance)

@@ -45,7 +45,8 @@ World coordinates are those of the recording (KITTI: x east, y north, z up, from
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -90,21 +91,15 @@ def write_covariances(
     write_text(path, "\n".join(rows) + "\n")
 
 
-def object_paths(estimate: JointEstimate) -> dict[int, FloatArray]:
-    """Return the places (n, 2), m, of each object, by id, from first to last."""
-    found: dict[int, list[FloatArray]] = {}
-    for objects in estimate.objects:
-        for name, place in zip(objects.id.tolist(), objects.position, strict=True):
-            found.setdefault(name, []).append(place)
-    return {name: np.array(places) for name, places in found.items()}
-
-
 def confirmed_paths(estimate: JointEstimate) -> dict[int, FloatArray]:
-    """Return those of objects that were detected `_CONFIRMED` times at least: pictures leave clutter out."""
+    """Places (n, 2), m, from first to last, of objects that were detected `_CONFIRMED` times at least, by id.
+
+    Pictures leave clutter out.
+    """
     seen = [estimate.assignment(row).id for row in range(len(estimate.timestamps))]
-    ids, counts = np.unique(np.concatenate([np.empty(0, dtype=np.int64), *seen]), return_counts=True)
-    known = set(ids[counts >= _CONFIRMED].tolist())
-    return {name: path for name, path in object_paths(estimate).items() if name in known}
+    ids, counts = np.unique(np.concatenate(seen), return_counts=True)
+    name, place = (np.concatenate([getattr(now, each) for now in estimate.objects]) for each in ("id", "position"))
+    return {known: place[name == known] for known in ids[counts >= _CONFIRMED].tolist()}
 
 
 def write_objects(path: Path, estimate: JointEstimate) -> None:
@@ -118,11 +113,6 @@ def write_objects(path: Path, estimate: JointEstimate) -> None:
             for name, label, row in zip(objects.id.tolist(), objects.label, table, strict=True)
         ]
     write_text(path, "\n".join(rows) + "\n")
-
-
-def planar_trajectory(time: FloatArray, world_T_pose: FloatArray) -> Trajectory:
-    """Return a trajectory in the plane, (N, 3, 3), as one in space at z = 0."""
-    return Trajectory(time, in_space(world_T_pose))
 
 
 def write_pose_graph(
@@ -147,7 +137,7 @@ def write_pose_graph(
     paths = {"guess": graph.world_T_pose[:, :d, d], "optimised": optimised.world_T_pose[:, :d, d]}
     best, points = graph.at(optimised.world_T_pose), {}
     if graph.landmarks is not None and optimised.landmarks is not None:
-        best = best.with_landmarks(graph.landmarks.at(optimised.landmarks))
+        best = best.with_landmarks(replace(graph.landmarks, position=optimised.landmarks))
         points = {"landmarks": optimised.landmarks}
     with atomic_directory(output, known=("covariances.csv",)) as folder:
         write_g2o(folder / "poses.g2o", best)
@@ -180,7 +170,7 @@ def write_laser_slam(
     wheels = np.linalg.inv(wheels[0]) @ wheels
     with atomic_directory(output) as folder:
         for name, poses in (("trajectory", path.poses), ("matched", path.matched), ("odometry", wheels)):
-            write_tum_poses(folder / f"{name}.tum", planar_trajectory(log.time[first], poses[first]))
+            write_tum_poses(folder / f"{name}.tum", Trajectory(log.time[first], in_space(poses[first])))
         write_g2o(folder / "poses.g2o", path.graph)
         write_bytes(
             folder / "map.png", png(occupancy_picture(grid.probability, grid.origin, grid.cell, path.poses[:, :2, 2]))
@@ -258,13 +248,11 @@ def reference(scans: ScanSequence) -> Trajectory | None:
 def degenerate_spans(times: FloatArray, degenerate: Sequence[tuple[str, ...]]) -> list[dict[str, Any]]:
     """Runs of scans that leave the same motions open: first and last scan, their times, s, and the motions in words."""
     spans = list[dict[str, Any]]()
-    for row, motions in enumerate(degenerate):
-        if spans and spans[-1]["motions"] == list(motions) and spans[-1]["last"] == row - 1:
-            spans[-1] |= {"last": row, "until": float(times[row])}
-        elif motions:
-            at = float(times[row])
-            spans.append({"first": row, "last": row, "from": at, "until": at, "motions": list(motions)})
-    return spans
+    for motions, run in groupby(range(len(degenerate)), key=degenerate.__getitem__):
+        rows = list(run)
+        begin, end = times[[rows[0], rows[-1]]].tolist()
+        spans.append({"first": rows[0], "last": rows[-1], "from": begin, "until": end, "motions": list(motions)})
+    return [span for span in spans if span["motions"]]
 
 
 def write_lidar_slam(
@@ -280,10 +268,11 @@ def write_lidar_slam(
     """
     s = settings or LidarSlamSettings()
     clouds, objects = [submap.points for submap in result.submaps], result.objects
-    points, lines = placed_clouds(clouds, result.world_T_submap, s.map_spacing), _lines(result)
+    points = placed_clouds(clouds, result.world_T_submap, s.map_spacing)
+    lines = {mark.number: _seen_pieces(result, mark) for mark in result.landmarks if mark.kind == WALL}
     figures, truth = metrics(result, scans), reference(scans)
     if objects is not None:
-        figures["objects"] = len(object_paths(objects))
+        figures["objects"] = len(np.unique(np.concatenate([now.id for now in objects.objects])))
     with atomic_directory(output, known=LIDAR_FILES) as folder:
         given = {name: getattr(result, name) for name in ("trajectory", "odometry", "online")}
         write_paths(folder, **given, reference=truth)
@@ -317,11 +306,6 @@ def write_paths(folder: Path, trajectory: Trajectory, **others: Trajectory | Non
             write_tum_poses(folder / f"{name}.tum", path)
 
 
-def _lines(result: SlamResult) -> dict[int, FloatArray]:
-    """Ends (n, 2, 2), from above, of the pieces of each wall that were observed."""
-    return {mark.number: _seen_pieces(result, mark) for mark in result.landmarks if mark.kind == WALL}
-
-
 def _poles(landmarks: Sequence[Landmark]) -> FloatArray:
     """Places (P, 2) of all but walls."""
     places = [mark.kind.coordinates(mark.state) for mark in landmarks if mark.kind != WALL]
@@ -335,10 +319,9 @@ def _seen_pieces(result: SlamResult, mark: Landmark) -> FloatArray:
     along = np.array([-normal[1], normal[0]])
     foot = (np.array([place["x"], place["y"]]) @ normal) * normal
     spans = []
-    for seen in result.observations:
-        extent = seen.observation.extent
-        if seen.landmark == mark.number and extent is not None:
-            u = transform_points(result.world_T_lidar[seen.pose], extent)[:, :2] @ along
+    for pose, now in zip(result.world_T_lidar, result.observations, strict=True):
+        for extent in (one.extent for number, one in now if number == mark.number and one.extent is not None):
+            u = transform_points(pose, extent)[:, :2] @ along
             spans.append((float(u.min()), float(u.max())))
     pieces = [np.stack([foot + low * along, foot + high * along]) for low, high in covered_spans(spans)]
     return np.array(pieces).reshape(-1, 2, 2)
@@ -383,12 +366,12 @@ def write_graph(folder: Path, result: SlamResult) -> None:
     write_g2o(folder / "graph.g2o", result.pose_graph())
     marks = {mark.number for mark in result.landmarks}
     rows = [",".join(_OBSERVED)]
-    for one in result.observations:
-        if one.landmark in marks:
-            z, P = one.observation.value, one.observation.covariance
-            fields = (z, P[np.triu_indices(len(P))])
-            value, covariance = (" ".join(f"{x:.17g}" for x in field) for field in fields)
-            rows.append(f"{one.pose},{one.landmark},{one.observation.kind.name},{value},{covariance}")
+    for keyframe, now in enumerate(result.observations):
+        for number, one in now:
+            if number in marks:
+                fields = (one.value, one.covariance[np.triu_indices(len(one.covariance))])
+                value, covariance = (" ".join(f"{x:.17g}" for x in field) for field in fields)
+                rows.append(f"{keyframe},{number},{one.kind.name},{value},{covariance}")
     write_text(folder / "observations.csv", "\n".join(rows) + "\n")
 
 

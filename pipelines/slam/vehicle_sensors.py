@@ -34,63 +34,6 @@ from saga_fg.types import Detections, EgoMeasurements, Frame, ImuSamples, WheelS
 _LOG = logging.getLogger(__name__)
 
 
-class BetweenKeyframes:
-    """Measurements that no keyframe has taken yet.
-
-    sensors: that the graph has; others_read: whether other providers may read the rest; speed_deviation: of wheel
-    speeds without one of their own, m/s
-    """
-
-    def __init__(self, sensors: Collection[str], others_read: bool, speed_deviation: float) -> None:
-        self._sensors, self._others_read, self._speed_deviation = sensors, others_read, speed_deviation
-        self._since: list[tuple[float, EgoMeasurements]] = []  # by the time of the scan that they came with
-        self._warned: set[str] = set()
-
-    def check(self, measured: EgoMeasurements) -> None:
-        """Raise `InputError` for a measurement that nothing reads, and warn once where only other providers may."""
-        for name in ("gps", "imu", "wheels"):
-            if getattr(measured, name) is None or name in self._sensors:
-                continue
-            if not self._others_read:
-                raise InputError(f"{name}: expected it among the sensors that were named, as in sensors=[{name!r}]")
-            if name not in self._warned:
-                _LOG.warning("%s: not among the sensors; only the providers that were given can read it", name)
-                self._warned.add(name)
-
-    def add(self, time: float, measured: EgoMeasurements) -> None:
-        """Add what came with a scan at `time`, s."""
-        self._since.append((time, measured))
-
-    def frame(self, time: float, detections: Detections | None) -> Frame | None:
-        """The measurements of a keyframe at `time`, s, besides its scan, for providers; the newest fix has its age."""
-        imu = [one.imu for _, one in self._since if one.imu is not None]
-        wheels = [one.wheels for _, one in self._since if one.wheels is not None]
-        fixes = [(then, one.gps) for then, one in self._since if one.gps is not None]
-        if not imu and not wheels and not fixes and detections is None:
-            return None
-        columns = ("dt", "acceleration", "angular_rate")
-        ego = EgoMeasurements(
-            gps=replace(fixes[-1][1], age=max(time - fixes[-1][0] + fixes[-1][1].age, 0.0)) if fixes else None,
-            imu=ImuSamples(*(np.concatenate([getattr(one, name) for one in imu]) for name in columns)) if imu else None,
-            wheels=self._mean_speed(wheels) if wheels else None,
-        )
-        return Frame(time, "lidar", Detections.empty() if detections is None else detections, None, "ego", ego=ego)
-
-    def clear(self) -> None:
-        """Everything was taken."""
-        self._since = []
-
-    def _mean_speed(self, wheels: Sequence[WheelSpeed]) -> WheelSpeed:
-        """The mean speed; errors of the speeds are independent."""
-        dt = np.array([one.dt for one in wheels])
-        share = dt / dt.sum() if dt.sum() > 0 else np.full(len(dt), 1 / len(dt))
-        deviation = None
-        if any(one.deviation is not None for one in wheels):
-            own = [self._speed_deviation if one.deviation is None else one.deviation for one in wheels]
-            deviation = float(np.linalg.norm(share * own))
-        return WheelSpeed(float(share @ [one.speed for one in wheels]), float(dt.sum()), deviation)
-
-
 _SCALE = 0.05  # standard deviation of the scale of wheels
 _STEP_NOISE = 0.02  # m, of a step that registration determines: it errs with the map
 _KNOWN_SCALE = 0.005  # standard deviation at which the scale is as good as known
@@ -240,16 +183,27 @@ class Vehicle:
         checked_transform("ego_T_lidar", self.ego_T_lidar)
 
 
+def mean_speed(wheels: Sequence[WheelSpeed], deviation: float) -> WheelSpeed:
+    """The mean of speeds, whose errors are independent; deviation: of those without one of their own, m/s."""
+    dt = np.array([one.dt for one in wheels])
+    share, stated = dt / dt.sum() if dt.sum() > 0 else np.full(len(dt), 1 / len(dt)), None
+    if any(one.deviation is not None for one in wheels):
+        own = [deviation if one.deviation is None else one.deviation for one in wheels]
+        stated = float(np.linalg.norm(share * own))
+    return WheelSpeed(float(share @ [one.speed for one in wheels]), float(dt.sum()), stated)
+
+
 class VehicleSensors:
-    """Sensors of the vehicle in a graph of the poses of its LiDAR.
+    """Sensors of the vehicle in a graph of the poses of its LiDAR, and what they measured since the last keyframe.
 
     others_read: whether other providers may read what sensors measure that are not among the vehicle's
     """
 
     def __init__(self, vehicle: Vehicle, others_read: bool = False) -> None:
         self.names, self._settings, self.ego_T_lidar = tuple(vehicle.sensors), vehicle.settings, vehicle.ego_T_lidar
-        self.lidar_T_ego = inverse_transform(self.ego_T_lidar)
-        self.since_keyframe = BetweenKeyframes(self.names, others_read, self._settings.wheels.deviation)
+        self.lidar_T_ego, self._others_read = inverse_transform(self.ego_T_lidar), others_read
+        self._since: list[tuple[float, EgoMeasurements]] = []  # the last keyframe, by the times of their scans
+        self._warned: set[str] = set()
         self.consistency = SensorConsistency(self.names, self._settings)
         self._wheels = WheelComparison(self._settings.wheels, self.ego_T_lidar)
         self._inertial = InertialPrediction(on_pose(self._settings.imu, self.lidar_T_ego))
@@ -273,8 +227,38 @@ class VehicleSensors:
             measured = replace(measured, wheels=used)
             if misfit:
                 self.consistency.state("wheels", misfit)
-        self.since_keyframe.add(time, measured)
+        self._since.append((time, measured))
         return step
+
+    def check(self, measured: EgoMeasurements) -> None:
+        """Raise `InputError` for a measurement that nothing reads, and warn once where only other providers may."""
+        for name in ("gps", "imu", "wheels"):
+            if getattr(measured, name) is None or name in self.names:
+                continue
+            if not self._others_read:
+                raise InputError(f"{name}: expected it among the sensors that were named, as in sensors=[{name!r}]")
+            if name not in self._warned:
+                _LOG.warning("%s: not among the sensors; only the providers that were given can read it", name)
+                self._warned.add(name)
+
+    def frame(self, time: float, detections: Detections | None = None) -> Frame | None:
+        """The measurements of a keyframe at `time`, s, besides its scan, for providers; the newest fix has its age."""
+        imu = [one.imu for _, one in self._since if one.imu is not None]
+        wheels = [one.wheels for _, one in self._since if one.wheels is not None]
+        fixes = [(then, one.gps) for then, one in self._since if one.gps is not None]
+        if not imu and not wheels and not fixes and detections is None:
+            return None
+        columns = ("dt", "acceleration", "angular_rate")
+        ego = EgoMeasurements(
+            gps=replace(fixes[-1][1], age=max(time - fixes[-1][0] + fixes[-1][1].age, 0.0)) if fixes else None,
+            imu=ImuSamples(*(np.concatenate([getattr(one, name) for one in imu]) for name in columns)) if imu else None,
+            wheels=mean_speed(wheels, self._settings.wheels.deviation) if wheels else None,
+        )
+        return Frame(time, "lidar", Detections.empty() if detections is None else detections, None, "ego", ego=ego)
+
+    def taken(self) -> None:
+        """A keyframe took all measurements so far."""
+        self._since = []
 
     def begin(self, smoother: IncrementalSmoother) -> None:
         """Predict from the newest keyframe of a graph on."""

@@ -33,7 +33,8 @@ search all combinations).
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
@@ -162,15 +163,6 @@ def observation_factors(
     return [replace(one, robust=robust) if isinstance(one, ResidualFactors) else one for one in factors]
 
 
-@dataclass(frozen=True, eq=False)
-class AssociatedObservation:
-    """An observation with the row of its pose and the number of the landmark that it was associated with."""
-
-    pose: int
-    observation: Observation
-    landmark: int
-
-
 _OPEN = 1e-9  # smallest singular value over the largest one of what determines a landmark
 
 
@@ -181,10 +173,29 @@ def whitened_jacobians(
 
     rows: (n, 2) keys of pose and landmark. Raises `InputError` naming the type for what its factors refuse.
     """
+    parts, k = [], kind.pose.dim
+    with _naming(kind, observed[0]):
+        for factor in kind.factors(rows, observed, covariances):
+            if isinstance(factor, ResidualFactors):
+                W, (by_pose, by_landmark), r = factor.linearisation(values)
+                parts.append(((W @ r[:, :, None])[:, :, 0], W @ by_pose, W @ by_landmark))
+            else:
+                A, b = factor.linearize(values).jacobian()
+                parts.append((-b[None], A[None, :, :k], A[None, :, k:]))
+        r, by_pose, by_landmark = (np.concatenate(of_parts) for of_parts in zip(*parts, strict=True))
+        return r, by_pose, by_landmark
+
+
+@contextmanager
+def _naming(kind: LandmarkType, observed: FloatArray) -> Iterator[None]:
+    """Name the type and the observation in an error of the type's own."""
     try:
-        return _linearised(kind, rows, observed, covariances, values)
+        yield
+    except InputError:
+        raise
     except Exception as error:
-        raise refused(kind, observed[0], error) from error
+        text = " ".join((str(error) if isinstance(error, ValueError) else repr(error)).split())
+        raise InputError(f"{kind.name} observed as {observed.tolist()}, which its type cannot read: {text}") from error
 
 
 def first_seen(observation: Observation, world_T_pose: FloatArray) -> tuple[Any, FloatArray, FloatArray]:
@@ -193,7 +204,8 @@ def first_seen(observation: Observation, world_T_pose: FloatArray) -> tuple[Any,
     Raises `InputError` naming the components of the state that the observation leaves open.
     """
     kind, values = observation.kind, gtsam.Values()
-    state = initial_state(observation, world_T_pose)
+    with _naming(kind, observation.value):
+        state = kind.initialise(world_T_pose, observation.value)
     values.insert(0, pose("world_T_pose", world_T_pose))
     values.insert(1, state)
     one = (np.array([[0, 1]]), observation.value[None], observation.covariance[None])
@@ -207,37 +219,6 @@ def first_seen(observation: Observation, world_T_pose: FloatArray) -> tuple[Any,
             f"expected an observation of all {kind.variable.dim}, or another landmark type that has only those observed"
         )
     return state, np.linalg.inv(by_landmark), by_pose
-
-
-def initial_state(observation: Observation, world_T_pose: FloatArray) -> Any:
-    """The state of a landmark by an observation. Raises `InputError` naming the type for what that refuses."""
-    try:
-        return observation.kind.initialise(world_T_pose, observation.value)
-    except Exception as error:
-        raise refused(observation.kind, observation.value, error) from error
-
-
-def refused(kind: LandmarkType, observed: FloatArray, error: Exception) -> InputError:
-    """Name the type and the observation in an error of the type's own."""
-    if isinstance(error, InputError):
-        return error
-    text = " ".join((str(error) if isinstance(error, ValueError) else repr(error)).split())
-    return InputError(f"{kind.name} observed as {observed.tolist()}, which its type cannot read: {text}")
-
-
-def _linearised(
-    kind: LandmarkType, rows: IntArray, observed: FloatArray, covariances: FloatArray, values: gtsam.Values
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    parts, k = [], kind.pose.dim
-    for factor in kind.factors(rows, observed, covariances):
-        if isinstance(factor, ResidualFactors):
-            W, (by_pose, by_landmark), r = factor.linearisation(values)
-            parts.append(((W @ r[:, :, None])[:, :, 0], W @ by_pose, W @ by_landmark))
-        else:
-            A, b = factor.linearize(values).jacobian()
-            parts.append((-b[None], A[None, :, :k], A[None, :, k:]))
-    r, by_pose, by_landmark = (np.concatenate(of_parts) for of_parts in zip(*parts, strict=True))
-    return r, by_pose, by_landmark
 
 
 POSE = 0  # key of the pose; landmarks have positive ones
@@ -374,10 +355,6 @@ class LocalMap:
         P[n:, n:] = G @ self.P[:k, :k] @ G.T + noise @ noise.T
         self.P = P
 
-    def check(self, observation: Observation) -> None:
-        """Raise `InputError` for an observation that a landmark cannot start with."""
-        first_seen(observation, self.pose.matrix())
-
     def _insert(self, landmark: int, kind: LandmarkType, state: Any) -> None:
         """Its columns of P are the next ones."""
         end = max(columns.stop for columns in self._columns.values())
@@ -389,19 +366,18 @@ class LocalMap:
         """The columns of P of some variables, one after the other."""
         return np.concatenate([np.arange(len(self.P))[self._columns[key]] for key in keys])
 
-    def _stacked(self, innovations: Sequence[Innovation]) -> tuple[FloatArray, FloatArray]:
+    def _stacked(self, innovations: Sequence[Innovation]) -> tuple[FloatArray, IntArray]:
         """The Jacobian (D, C) of innovations by the columns (C,) of P that it touches."""
         k = self._columns[POSE].stop
         rows = sum(len(i.r) for i in innovations)
         A = np.zeros((rows, k + sum(i.by_landmark.shape[1] for i in innovations)))
-        columns, row, column = [np.arange(k)], 0, k
+        row, column = 0, k
         for i in innovations:
             m, d = i.by_landmark.shape
             A[row : row + m, :k] = i.by_pose
             A[row : row + m, column : column + d] = i.by_landmark
-            columns.append(np.arange(len(self.P))[self._columns[i.landmark]])
             row, column = row + m, column + d
-        return A, np.concatenate(columns)
+        return A, self._columns_of([POSE, *(i.landmark for i in innovations)])
 
     def _retract(self, delta: FloatArray) -> None:
         self.values.update(POSE, self.pose.retract(delta[self._columns[POSE]]))

@@ -13,7 +13,7 @@ from data_tools.lidar import Scan
 from pipelines.slam.drive import motion, shared
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings
 from pipelines.slam.odometry import LidarOdometry, OdometryStep
-from pipelines.slam.vehicle_sensors import BetweenKeyframes, Vehicle
+from pipelines.slam.vehicle_sensors import Vehicle, mean_speed
 from saga_fg import Detections, InputError
 from saga_fg.graph import Additions, GraphView
 from saga_fg.numerics import yaw_transform
@@ -194,22 +194,15 @@ def test_a_fix_between_keyframes_waits_for_the_next() -> None:
 
 
 def test_joined_speeds_keep_their_deviation() -> None:
-    def joined(*speeds: WheelSpeed) -> WheelSpeed | None:
-        between = BetweenKeyframes(["wheels"], False, 0.2)
-        for k, speed in enumerate(speeds):
-            between.add(0.1 * k, EgoMeasurements(wheels=speed))
-        frame = between.frame(1.0, None)
-        return None if frame is None or frame.ego is None else frame.ego.wheels
+    def joined(*speeds: WheelSpeed) -> WheelSpeed:
+        return mean_speed(speeds, 0.2)
 
     both = joined(WheelSpeed(1.0, 0.1, 0.3), WheelSpeed(3.0, 0.3, 0.4))
-    assert both is not None
     assert both.speed == pytest.approx(2.5)
     assert both.dt == pytest.approx(0.4)
     assert both.deviation == pytest.approx(np.hypot(0.25 * 0.3, 0.75 * 0.4))
     mixed, unknown = joined(WheelSpeed(1.0, 0.1), WheelSpeed(1.0, 0.1, 0.4)), joined(WheelSpeed(1.0, 0.1))
-    assert mixed is not None
     assert mixed.deviation == pytest.approx(0.5 * np.hypot(0.2, 0.4))
-    assert unknown is not None
     assert unknown.deviation is None
 
 

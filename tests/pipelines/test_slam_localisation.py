@@ -287,7 +287,7 @@ def test_maps_and_guesses_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"line 2: file: expected a file beside submaps\.csv"):
         read_map(tmp_path)
     (tmp_path / "submaps.csv").write_text("number,file,x,y,z,qx,qy,qz,qw\n0,a.ply,0,0,0,0,0,0,2\n")
-    with pytest.raises(InputError, match="line 2: expected a quaternion"):
+    with pytest.raises(InputError, match="line 2: qx qy qz qw: expected a unit quaternion"):
         read_map(tmp_path)
     (tmp_path / "origin.csv").write_text("latitude [deg],longitude [deg],altitude [m]\n91,8,100\n")
     (tmp_path / "submaps.csv").write_text("number,file,x,y,z,qx,qy,qz,qw\n")

@@ -210,7 +210,7 @@ def loops_drive() -> tuple[list[Submap], FloatArray]:
             [transform_points(inverse_transform(frame) @ course.world_T_ego[k], course[int(k)].points) for k in rows]
         )
         points = points[voxel_downsample(points, 0.4)].astype(np.float32)
-        submaps.append(Submap(number, (number, number + 1), number, np.eye(4), points, (way, way + 30.0)))
+        submaps.append(Submap((number, number + 1), np.eye(4), points, (way, way + 30.0)))
         frames.append(frame)
     return submaps, np.array(frames)
 
@@ -256,7 +256,7 @@ def test_row_houses_are_no_place():
         scans = [simulate_scan(world, inverse_transform(start_T_world) @ step, rng, SMALL).points for step in steps]
         placed = [transform_points(step, scan) for step, scan in zip(steps, scans, strict=True)]
         points = np.concatenate(placed).astype(np.float32)
-        submaps.append(Submap(number, (number, number + 1), number, np.eye(4), points, (start, start + 16.0)))
+        submaps.append(Submap((number, number + 1), np.eye(4), points, (start, start + 16.0)))
         frames.append(yaw_transform(10.0 * number, z=1.8))  # an odometry that says that the vehicle came back
     search = PlaceLoops()
     assert [len(search.add(one, np.array(frames[: k + 1]))) for k, one in enumerate(submaps)] == [0, 0]
@@ -266,7 +266,7 @@ def test_a_submap_without_points_has_no_loops(loops_drive):
     submaps, true = loops_drive
     search = PlaceLoops()
     assert search.add(submaps[0], true[:1]) == []
-    bare = Submap(1, (1, 2), 1, np.eye(4), np.empty((0, 3), dtype=np.float32), (30.0, 60.0))
+    bare = Submap((1, 2), np.eye(4), np.empty((0, 3), dtype=np.float32), (30.0, 60.0))
     assert search.add(bare, true[:2]) == []
 
 

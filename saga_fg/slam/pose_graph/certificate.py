@@ -271,36 +271,18 @@ def lowest_eigenvalue(cost: ChordalCost, Y: FloatArray) -> LowestEigenvalue:
     flat = Y.reshape(n * d, r)
     QY = cost.times(flat)
     L = multipliers(Y, QY.reshape(Y.shape))
-    S = _with_positions(cost, L)
+    free = np.delete(np.arange(cost.M.shape[0]), d)  # without the first position
+    blocks = np.zeros((n, d + 1, d + 1))
+    blocks[:, :d, :d] = L
+    points = csc_array((cost.M.shape[0] - n * (d + 1),) * 2)
+    S = (cost.M - block_diag([*blocks, points], format="csc")).tocsc()[free][:, free]
+    on_rotations = diags_array(np.isin(free, cost.rotations).astype(np.float64)).tocsc()
     eta = max(GAP * float((flat * QY).sum()) / (n * d), _ROUNDING * float(abs(cost.M).max()))
     count = 1
-    while _negative(solver := factorised(S + _on_rotations(cost, eta))):
+    while ((solver := factorised(S + eta * on_rotations)).U.diagonal() <= 0).any():
         count, eta = count + 1, eta * _LARGER
     value, vector = _eigenpair(cost, L, solver, eta)
     return LowestEigenvalue(min(value, 0.0) - 2 * _ACCURACY * eta, vector.reshape(n, d) if count > 1 else None, count)
-
-
-def _negative(solver: SuperLU) -> bool:
-    return bool((solver.U.diagonal() <= 0).any())
-
-
-def _with_positions(cost: ChordalCost, L: FloatArray) -> csc_array:
-    """M less the multipliers, without the first position."""
-    whole = np.zeros((len(L), cost.dim + 1, cost.dim + 1))
-    whole[:, : cost.dim, : cost.dim] = L
-    points = csc_array((cost.M.shape[0] - whole.shape[0] * whole.shape[1],) * 2)
-    return _without_first_position(cost, (cost.M - block_diag([*whole, points], format="csc")).tocsc())
-
-
-def _on_rotations(cost: ChordalCost, eta: float) -> csc_array:
-    diagonal = np.zeros(cost.M.shape[0])
-    diagonal[cost.rotations] = eta
-    return _without_first_position(cost, diags_array(diagonal).tocsc())
-
-
-def _without_first_position(cost: ChordalCost, matrix: csc_array) -> csc_array:
-    kept = np.delete(np.arange(cost.M.shape[0]), cost.dim)
-    return matrix[kept][:, kept]
 
 
 def _eigenpair(cost: ChordalCost, L: FloatArray, solver: SuperLU, eta: float) -> tuple[float, FloatArray]:

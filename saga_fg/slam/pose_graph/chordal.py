@@ -49,7 +49,6 @@ import numpy as np
 from scipy.sparse import block_diag, bsr_array, csc_array, csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
-from saga_fg.errors import InputError
 from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.slam.pose_graph.graph import PoseGraph
 
@@ -189,9 +188,7 @@ def chordal_poses(graph: PoseGraph) -> FloatArray:
     """
     d, inner = graph.dim, replace(graph, places=None)
     whole = inner.with_frame_as_pose()
-    apart = whole.components() != 0
-    if apart.any():
-        raise InputError(f"pose {int(whole.ids[apart][0])}: expected measurements that connect it with the first pose")
+    whole.check_connected()
     kappa, tau = edge_weights(whole)
     poses = np.tile(np.eye(d + 1), (len(whole), 1, 1))
     poses[:, :d, :d] = _rotations(whole, kappa)

@@ -17,9 +17,10 @@ and for given poses its place is the minimum of the sum of  || R z + t - l ||^2_
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from factors import ResidualFactors, relative_factors
 from saga_fg.errors import InputError
@@ -32,9 +33,6 @@ from saga_fg.numerics import (
     checked_ids,
     checked_rows,
 )
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 _FLAT = 1e-9  # of the largest coordinate, below which known places lie on one line
 
@@ -114,10 +112,6 @@ class PointLandmarks:
         z = checked("z", self.z, (n, np.asarray(self.position).shape[-1]))
         checked_covariances("information", self.information, n, z.shape[1])
 
-    def at(self, position: FloatArray) -> PointLandmarks:
-        """A copy with the landmarks at other places."""
-        return replace(self, position=position)
-
     def factors(self, landmark_key: int) -> ResidualFactors:
         """Factors of the keys of a graph: poses from 0, landmarks from `landmark_key`."""
         keys = np.stack([self.pose, self.landmark + landmark_key], axis=1)
@@ -133,7 +127,7 @@ class PointLandmarks:
         H, b = np.zeros((len(self.ids), d, d)), np.zeros((len(self.ids), d, 1))
         np.add.at(H, self.landmark, each)
         np.add.at(b, self.landmark, each @ (R @ self.z[:, :, None] + t))
-        return self.at(np.asarray(np.linalg.solve(H, b)[:, :, 0]))
+        return replace(self, position=np.asarray(np.linalg.solve(H, b)[:, :, 0]))
 
 
 _ORTHONORMAL = 1e-6
@@ -238,11 +232,6 @@ class PoseGraph:
         return replace(self, landmarks=landmarks)
 
     @property
-    def poses_alone(self) -> bool:
-        """True if there are neither landmarks nor anything known from outside."""
-        return self.landmarks is None and not self.anchored
-
-    @property
     def anchored(self) -> bool:
         """True if priors or places say where the graph is."""
         return self.priors is not None or self.places is not None
@@ -282,10 +271,15 @@ class PoseGraph:
             return np.asarray(self.world_T_pose[0] @ np.linalg.inv(poses[0]) @ poses)
         return np.asarray(np.linalg.inv(poses[-1]) @ poses[:-1])
 
+    def check_connected(self) -> None:
+        """Raise `InputError` for a graph that measurements between poses do not connect."""
+        apart = self.components() != 0
+        if apart.any():
+            named = int(self.ids[apart][0])
+            raise InputError(f"pose {named}: expected measurements that connect it with the first pose")
+
     def components(self) -> IntArray:
         """Return the connected component (N,) of each pose, numbered from 0 in the order of their first poses."""
-        from scipy.sparse.csgraph import connected_components
-
         _, label = connected_components(_joined(self))
         _, first_row, part = np.unique(label, return_index=True, return_inverse=True)
         return np.asarray(np.argsort(np.argsort(first_row))[part], dtype=np.int64)
@@ -298,15 +292,11 @@ def trusted(graph: PoseGraph) -> BoolArray:
 
 def _joined(graph: PoseGraph) -> csr_array:
     """Sparse matrix (N, N) with an entry for each measured pair."""
-    from scipy.sparse import coo_array
-
     entries = (np.ones(len(graph.first)), (graph.first, graph.second))
     return coo_array(entries, shape=(len(graph), len(graph))).tocsr()
 
 
 def _dead_reckoned(graph: PoseGraph) -> FloatArray:
-    from scipy.sparse.csgraph import breadth_first_order
-
     first, second = graph.first.tolist(), graph.second.tolist()
     order, before = breadth_first_order(_joined(graph), 0, directed=False)
     edge_of = dict(zip(zip(first, second, strict=True), range(len(first)), strict=True))

@@ -168,7 +168,7 @@ def solved_graph(graph: PoseGraph, values: gtsam.Values) -> PoseGraph:
     if graph.landmarks is None:
         return solved
     places = np.stack([values.atVector(len(graph) + row) for row in range(len(graph.landmarks.ids))])
-    return solved.with_landmarks(graph.landmarks.at(places))
+    return solved.with_landmarks(replace(graph.landmarks, position=places))
 
 
 def factor_graph(graph: PoseGraph, robust: Robust | None = None) -> gtsam.NonlinearFactorGraph:
@@ -245,9 +245,7 @@ def consensus(graph: PoseGraph) -> Consensus:
 
     Raises `InputError` for a graph that measurements between poses do not connect.
     """
-    apart = graph.components() != 0
-    if apart.any():
-        raise InputError(f"pose {int(graph.ids[apart][0])}: expected measurements that connect it with the first pose")
+    graph.check_connected()
     if not len(graph.first):
         return Consensus(graph, np.ones(0, dtype=bool))
     loop = ~_spanning(graph)
@@ -276,14 +274,10 @@ def _spanning(graph: PoseGraph) -> BoolArray:
     odometry = trusted(graph)
     n = len(graph)
     cost = np.where(odometry, 1.0, 2.0)
-    low, high = np.minimum(graph.first, graph.second), np.maximum(graph.first, graph.second)
-    order = np.lexsort((cost, high, low))  # the cheapest of several between the same two
-    pairs = low[order] * n + high[order]
-    once = order[np.concatenate([[True], pairs[1:] != pairs[:-1]])]
-    tree = minimum_spanning_tree(csr_array((cost[once], (low[once], high[once])), shape=(n, n))).tocoo()
-    return np.asarray(
-        odometry | np.isin(np.arange(len(low)), once[np.isin(low[once] * n + high[once], tree.row * n + tree.col)])
-    )
+    lengths, once = _shortest_edges(graph.first, graph.second, cost, n)
+    tree = minimum_spanning_tree(lengths).tocoo()
+    low, high = np.minimum(graph.first, graph.second)[once], np.maximum(graph.first, graph.second)[once]
+    return np.asarray(odometry | np.isin(np.arange(len(cost)), once[np.isin(low * n + high, tree.row * n + tree.col)]))
 
 
 def _spanning_start(graph: PoseGraph, spanning: BoolArray) -> FloatArray:
@@ -462,9 +456,14 @@ _SHORTEST = 1e-6  # m: a sparse matrix takes 0 for no measurement
 
 def shortest_paths(first: IntArray, second: IntArray, length: FloatArray, poses: int, row: int) -> FloatArray:
     """Lengths (poses,) of shortest paths from a pose along measurements (M,) of these lengths; infinite without one."""
+    return np.asarray(dijkstra(_shortest_edges(first, second, length, poses)[0], directed=False, indices=row))
+
+
+def _shortest_edges(first: IntArray, second: IntArray, length: FloatArray, poses: int) -> tuple[csr_array, IntArray]:
+    """Lengths (poses, poses) of the shortest of several measurements (M,) between the same two, and their rows."""
     low, high = np.minimum(first, second), np.maximum(first, second)
-    order = np.lexsort((length, high, low))  # the shortest of several between the same two
+    order = np.lexsort((length, high, low))
     _, once = np.unique(low[order] * poses + high[order], return_index=True)
     kept = order[once]
-    joined = csr_array((np.maximum(length[kept], _SHORTEST), (low[kept], high[kept])), shape=(poses, poses))
-    return np.asarray(dijkstra(joined, directed=False, indices=row))
+    entries = (np.maximum(length[kept], _SHORTEST), (low[kept], high[kept]))
+    return csr_array(entries, shape=(poses, poses)), kept

@@ -1,4 +1,4 @@
-from .between import LoopClosure, Loops, LoopSelection, loop_factors, select_loops
+from .between import LoopClosure, Loops, LoopSelection, drive_graph, loop_factors, select_loops
 from .graph import SolvedDrive, SubmapGraph, SubmapSettings
 
 __all__ = [
@@ -8,6 +8,7 @@ __all__ = [
     "SolvedDrive",
     "SubmapGraph",
     "SubmapSettings",
+    "drive_graph",
     "loop_factors",
     "select_loops",
 ]

@@ -37,7 +37,6 @@ that some s leads to gets the s that fits it; the cheapest is taken. So a loop a
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 from typing import Any, Self
 
@@ -218,13 +217,9 @@ class Loops:
     epochs: Sequence[int]
     name: str = "loops"
 
-    @cached_property
-    def last(self) -> int | None:
-        """The last epoch of a loop, None without one."""
-        return max((self.epochs[end] for loop in self.loops for end in (loop.first, loop.second)), default=None)
-
     def factors(self, view: GraphView) -> Additions:
-        return Additions(factors=loop_factors(self.loops, self.epochs, None) if view.epoch == self.last else [])
+        last = max((self.epochs[end] for loop in self.loops for end in (loop.first, loop.second)), default=None)
+        return Additions(factors=loop_factors(self.loops, self.epochs, None) if view.epoch == last else [])
 
 
 _FALSE = 1e-3  # probability that a proven loop is false
@@ -251,6 +246,16 @@ class LoopSelection:
         """A covariance (6, 6) of odometry."""
         scale = np.repeat(self.inflation, 3)
         return np.asarray(covariance * np.outer(scale, scale))
+
+
+def drive_graph(steps: Sequence[Motion], loops: Sequence[LoopClosure], first: PosePriors) -> PoseGraph:
+    """The graph of poses 0 .. n, at dead reckoning, with the motion from each to the next, and loops between them."""
+    ends = [*pairwise(range(len(steps) + 1)), *((loop.first, loop.second) for loop in loops)]
+    begin, end = np.array(ends, dtype=np.int64).reshape(-1, 2).T
+    between = np.array([*(T for T, _ in steps), *(loop.first_T_second for loop in loops)]).reshape(-1, 4, 4)
+    covariances = np.array([*(P for _, P in steps), *(loop.covariance for loop in loops)]).reshape(-1, 6, 6)
+    ids, information = np.arange(len(steps) + 1, dtype=np.int64), _symmetric(np.linalg.inv(covariances))
+    return PoseGraph.of_measurements(ids, begin, end, between, information, first)
 
 
 def select_loops(motions: Sequence[Motion], anchors: Sequence[int], loops: Sequence[LoopClosure]) -> LoopSelection:
@@ -295,13 +300,8 @@ class _AnchoredLoops:
 
     @classmethod
     def from_steps(cls, steps: Sequence[Motion], loops: Sequence[LoopClosure]) -> Self:
-        ends = [*pairwise(range(len(steps) + 1)), *((loop.first, loop.second) for loop in loops)]
-        first, second = np.array(ends, dtype=np.int64).T
-        between = np.array([*(T for T, _ in steps), *(loop.first_T_second for loop in loops)])
         parts = np.array([P for _, P in steps])
-        information = np.linalg.inv([*parts.sum(axis=1), *(loop.covariance for loop in loops)])
-        ids = np.arange(len(steps) + 1, dtype=np.int64)
-        return cls(PoseGraph.of_measurements(ids, first, second, between, _symmetric(information), _FIRST), parts)
+        return cls(drive_graph([(T, P.sum(axis=0)) for T, P in steps], loops, _FIRST), parts)
 
     def graph(self, inflation: FloatArray) -> PoseGraph:
         """The graph with odometry's deviations of rotation and of translation (2,) times as large."""

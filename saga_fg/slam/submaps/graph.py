@@ -37,7 +37,6 @@ from saga_fg.graph import Additions, FactorProvider, GraphView, SceneFactorGraph
 from saga_fg.numerics import FloatArray, inverse_transform
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.mapping import (
-    AssociatedObservation,
     Given,
     LandmarkObservations,
     LocalMap,
@@ -182,11 +181,6 @@ class SubmapSettings(Settings):
         """The loss of landmarks."""
         return Robust("geman-mcclure", self.robust_scale)
 
-    @property
-    def robust_loops(self) -> Robust:
-        """The loss of loops."""
-        return Robust("cauchy", self.robust_scale)
-
 
 _SOLVER = SolverSettings(tolerance=1e-4, max_iterations=30)
 _AFTER_LOOPS = RelinearisationSettings(0.01)  # deviations are those before the loop, which makes them smaller
@@ -239,7 +233,7 @@ class SubmapGraph:
         self.smoother = IncrementalSmoother(lag=None, settings=relinearisation, elimination="cholesky")
         self._motions: list[Motion] = [(world_T_first, covariance)]
         self._times: list[float] = []
-        self._seen: list[Sequence[tuple[int, Observation]]] = []
+        self.seen: list[Sequence[tuple[int, Observation]]] = []  # by keyframe, with the numbers of landmarks
         self.anchors: list[int] = []  # keyframes, that of the running submap last
         self._offsets: list[FloatArray] = []  # of keyframes from the anchors of their submaps, where that is closed
         self._loops: list[LoopClosure] = []  # between submaps, by their numbers
@@ -281,7 +275,7 @@ class SubmapGraph:
         if k:
             self._motions.append(measured)
         self._times.append(time)
-        self._seen.append(now)
+        self.seen.append(now)
         if begins:
             self._begin_submap(k)
         return begins and k > 0
@@ -293,7 +287,7 @@ class SubmapGraph:
                 raise InputError(f"loop: expected two submaps in order, got {loop.first} and {loop.second}")
         if not loops:
             return
-        factors = loop_factors(loops, self.anchors, self.settings.robust_loops)
+        factors = loop_factors(loops, self.anchors, Robust("cauchy", self.settings.robust_scale))
         self.smoother.extend([Given(Additions(factors=factors), "loops")], settings=_AFTER_LOOPS)
         self._loops += loops
 
@@ -321,10 +315,6 @@ class SubmapGraph:
         for k in range(closed, len(self)):
             poses[k] = self._running(k)
         return poses
-
-    def observations(self) -> list[AssociatedObservation]:
-        """All observations with their keyframes and landmarks."""
-        return [AssociatedObservation(k, one, n) for k, now in enumerate(self._seen) for n, one in now]
 
     def finish(self) -> SolvedDrive:
         """Choose the loops that agree, and solve all measurements together."""
@@ -363,7 +353,7 @@ class SubmapGraph:
         self._way = 0.0
 
     def _close(self, anchor: int, successor: int) -> None:
-        mine = {n for now in self._seen[anchor:successor] for n, _ in now}
+        mine = {n for now in self.seen[anchor:successor] for n, _ in now}
         world = inverse_transform(self._running(anchor))
         self._offsets += [np.eye(4), *(world @ self._running(k) for k in range(anchor + 1, successor))]
         variables, anchors = self.smoother.graph().variables.values(), set(map(pose_key, self.anchors))
@@ -373,15 +363,15 @@ class SubmapGraph:
 
     def _confirmed(self) -> dict[int, Sequence[tuple[int, Observation]]]:
         """Observations of landmarks that were seen often enough, by keyframe."""
-        counts = Counter(n for now in self._seen for n, _ in now)
+        counts = Counter(n for now in self.seen for n, _ in now)
         often = {n for n, count in counts.items() if count >= self.settings.confirm_after}
-        return {k: [(n, one) for n, one in now if n in often] for k, now in enumerate(self._seen)}
+        return {k: [(n, one) for n, one in now if n in often] for k, now in enumerate(self.seen)}
 
     def _starts(self, poses: FloatArray) -> Mapping[int, Any]:
         """Initial values of landmarks; in closed submaps from the last observation, since anchors have moved."""
         start: dict[int, Any] = {}
         running = self.smoother.graph().variables
-        for k, now in enumerate(self._seen):
+        for k, now in enumerate(self.seen):
             for number, one in now:
                 if landmark_key(number) not in running:
                     start[number] = one.kind.initialise(poses[k], one.value)

@@ -191,10 +191,10 @@ def test_submaps_stand_upright_and_have_small_finite_points():
     np.testing.assert_allclose(world_T_submap[:3, 2], [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(np.arctan2(world_T_submap[1, 0], world_T_submap[0, 0]), 0.7)
     np.testing.assert_allclose(world_T_submap[:3, 3], [3, 4, 1])
-    submap = Submap(0, (0, 5), 0, np.eye(4), np.ones((3, 3)), (0.0, 4.0))
+    submap = Submap((0, 5), np.eye(4), np.ones((3, 3)), (0.0, 4.0))
     assert submap.points.dtype == np.float32
-    with pytest.raises(InputError, match="points: expected finite coordinates"):
-        Submap(0, (0, 5), 0, np.eye(4), np.full((3, 3), np.nan), (0.0, 4.0))
+    with pytest.raises(InputError, match=r"points\[0, 0\]: expected a finite number"):
+        Submap((0, 5), np.eye(4), np.full((3, 3), np.nan), (0.0, 4.0))
 
 
 # Places: the same one is found however it lies, and nothing is found where nothing is

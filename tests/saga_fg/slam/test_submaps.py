@@ -131,8 +131,8 @@ def test_a_graph_stays_small_and_landmarks_keep_their_numbers():
     assert max(sizes[150:]) < max(sizes[:50]) + 200 / 20
     assert len(graph.anchors) == 10
     by_submap: dict[int, set[int]] = {}
-    for one in graph.observations():
-        by_submap.setdefault(int(np.searchsorted(graph.anchors, one.pose, side="right")) - 1, set()).add(one.landmark)
+    for k, now in enumerate(graph.seen):
+        by_submap.setdefault(int(np.searchsorted(graph.anchors, k, side="right")) - 1, set()).update(n for n, _ in now)
     assert all(not by_submap[i] & by_submap[i + 1] for i in range(9))
     poles = [mark for mark in graph.finish().landmarks if mark.kind == POLE]
     off = [np.linalg.norm(drive.poles - mark.state, axis=1).min() for mark in poles]
@@ -144,7 +144,7 @@ def test_far_from_the_start_association_is_the_same():
     graphs = [started(near), started(far)]
     for drive, graph in zip((near, far), graphs, strict=True):
         drive.into(graph, range(60))
-    numbers = [[one.landmark for one in graph.observations()] for graph in graphs]
+    numbers = [[n for now in graph.seen for n, _ in now] for graph in graphs]
     assert numbers[0] == numbers[1]
 
 
@@ -155,9 +155,9 @@ def test_fronts_in_one_plane_are_walls_of_their_own():
     graph = SubmapGraph(np.eye(4), FIRST)
     graph.append(0.0, None, [seen(0.0, 8.0), seen(12.0, 8.02)])
     graph.append(0.1, (yaw_transform(1.0), Q), [seen(4.0, 8.0), seen(11.0, 8.02)])  # on from the first; the second
-    assert [one.landmark for one in graph.observations()] == [1, 2, 1, 2]
+    assert [n for now in graph.seen for n, _ in now] == [1, 2, 1, 2]
     graph.append(0.2, (yaw_transform(1.0), Q), [seen(22.0, 8.0), Observation(WALL, [0, -1, 0, 8.0], Q[:3, :3])])
-    assert graph.observations()[-2].landmark == 3
+    assert graph.seen[-1][0][0] == 3
 
 
 def test_a_loop_moves_submaps_as_a_whole():
