@@ -15,7 +15,7 @@ from pipelines.config import TrackConfig
 from saga_fg import Curvilinear, Dataset, Frame, InputError, Scene, TrackerSettings, Tracks
 from saga_fg.model import acting_classes, sensor_model
 from saga_fg.numerics import FloatArray
-from saga_fg.tables import Sample, findings_of, idle_lanes, idle_rules, settings_without_data
+from saga_fg.tables import Sample, findings_of, idle_lanes, idle_rules, seems_dense_traffic, settings_without_data
 from saga_fg.tracking import estimator_parameters
 from saga_fg.types import DEFAULT, LANE, MAP_CLASSES, STOP_LINE, Finding, Mend, refuse_contradictions
 
@@ -31,6 +31,7 @@ class Checks:
     settings    of the run
     usual       the shipped settings: what a file for --config adds to them should meet something in the data
     option_for  the options of the command that mend a suspicion, "" for none
+    live_plain  whether live frames that look like dense traffic are told, as --like is left out
     """
 
     def __init__(
@@ -38,8 +39,9 @@ class Checks:
         settings: TrackConfig,
         usual: TrackConfig | None = None,
         option_for: Callable[[Mend], str] = lambda mend: "",
+        live_plain: bool = False,
     ) -> None:
-        self._settings, self._option_for = settings, option_for
+        self._settings, self._option_for, self._live_plain = settings, option_for, live_plain
         self._acting = acting_classes(settings.tracker.edges)
         usual = usual or settings
         self._own_classes = set(settings.tracker.classes) - set(usual.tracker.classes) - {DEFAULT}
@@ -120,6 +122,11 @@ class Checks:
             sample = Sample.from_frames(self._live, np.concatenate(self._yaw))
             self._note(sample)
             self._tell(findings_of(sample, self._logits))
+            why = seems_dense_traffic(self._live) if self._live_plain else ""
+            if why:
+                self._tell(
+                    [Finding("dense", f"dense traffic: {why}", "expected settings for it", option="--like dense")]
+                )
             self.finish()
             self._live, self._yaw = [], []
 

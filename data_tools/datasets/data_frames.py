@@ -55,7 +55,8 @@ def found_results(
     if detections is not None:
         dataset = DetectionTable(raw_table(detections, how))
     if truth is not None:
-        raw = raw_table(truth, truth_how or how, TRUTH_COLUMNS, TRACK_REQUIRED)
+        within = "how" if truth_how is None else "truth_how"
+        raw = raw_table(truth, truth_how or how, TRUTH_COLUMNS, TRACK_REQUIRED, within)
         true = TruthTable.from_table(raw, partial(tell, depth=_DEPTH))
         dataset = true if dataset is None else DetectedTruth(true, dataset)
     return table_results(

@@ -15,7 +15,7 @@ from data_tools.metrics import SceneBoxes
 from data_tools.metrics.misalignment import misalignment
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import FloatArray, IntArray
-from saga_fg.tables import usual_class
+from saga_fg.tables import NAME, option_text, usual_class
 from saga_fg.types import Dataset, Mend, Scene, known_velocities
 
 if TYPE_CHECKING:
@@ -200,7 +200,9 @@ def _warn_of_classes(results: Mapping[str, SceneResult], path: Path, how: TableI
     alike = {name: each for name in missed for each in tracked if usual_class(name) == usual_class(each) is not None}
     if len(tracked) == len(missed) == 1 and None in (usual_class(tracked[0]), usual_class(missed[0])):
         alike = {missed[0]: tracked[0]}
-    hint = f"; name them alike: {how.mended(Mend(classes=alike), {}).options().strip()}" if alike else ""
+    named = how.mended(Mend(classes=alike), {})
+    mend = option_text(named.values(), "how") if path == Path(NAME) else named.options().strip()
+    hint = f"; name them alike: {mend}" if alike else ""
     log.warning("%s: %s have no counterpart of their class, nothing of them can match%s", path, alone, hint)
 
 

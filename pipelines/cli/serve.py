@@ -39,7 +39,8 @@ from pipelines.serving.settings import LogLimitFilter
 from pipelines.tracking import one_thread, return_large_blocks
 from saga_fg.errors import InputError
 from saga_fg.kernels.compilation import load_kernels
-from saga_fg.tables import pairs
+from saga_fg.tables import option_text, pairs
+from saga_fg.types import Mend
 
 DEFAULT_ADDRESS = "127.0.0.1:7447"
 
@@ -83,6 +84,14 @@ class ServiceOptions:
         ),
     ] = None
     learn_offsets: how.LearnOffsetsOption = None
+    like: Annotated[
+        Literal["plain", "dense"] | None,
+        typer.Option(
+            "--like",
+            help="Settings to begin with: dense for road traffic seen by a sensor that stands or hovers, plain for all "
+            "else; --config lies over them.  [default: plain, and the log says if the first frames look dense]",
+        ),
+    ] = None
 
 
 def _serve_stream(
@@ -206,7 +215,10 @@ def _serve_ros2(
         ready(node.about)
         node.run(stop)
 
-    _run(service, tracker, config, verbose, run, shown=shown_tracks)
+    def option_for(mend: Mend) -> str:
+        return option_text({"classes": mend.classes})
+
+    _run(service, tracker, config, verbose, run, option_for, shown=shown_tracks)
 
 
 serve_ros2 = how.as_command(_serve_ros2)
@@ -219,19 +231,26 @@ def _run(
     config: Path | None,
     verbose: bool,
     run: Callable[[StreamTracker[Any], Ready, StopRequest], None],
+    option_for: Callable[[Mend], str] = lambda mend: "",
     **answers: Any,
 ) -> None:
-    """Run a service until its source ends or it is told to stop; answers: how the stream answers."""
+    """Run a service until its source ends or it is told to stop.
+
+    option_for  the options of the command that mend a suspicion; answers: how the stream answers
+    """
     if not verbose:
         for handler in logging.getLogger().handlers:
             handler.addFilter(LogLimitFilter())
     method = tracker.method
     how.check_learn_offsets(service.learn_offsets, method)
-    settings = tracker.configured("file", config)
+    family = "dense" if service.like == "dense" else "file"
+    settings = tracker.configured(family, config)
+    if service.like is not None and config is not None:
+        typer.echo(f"{config}: over the settings of --like {service.like}", err=True)
     bounds = StreamSettings() if service.limits is None else load_settings(StreamSettings, service.limits)
     if service.reorder is not None:
         bounds = replace(bounds, reorder=service.reorder)
-    checks = Checks(settings.of_method(method), load_config("file"))
+    checks = Checks(settings.of_method(method), load_config(family), option_for, service.like is None)
     stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), bounds, checks, **answers)
     return_large_blocks()
     kept = service.snapshot

@@ -439,7 +439,7 @@ def smooth(
     table or a correction that can't be used.
     """
     given = checked_corrections(corrections)
-    found = read_scenes(detections, how or TableImport(), settings or TrackerSettings(min_hits=2), sensors)
+    found = read_scenes(detections, how or TableImport(), settings or TrackerSettings(min_hits=2), sensors, "how")
     labels, outcomes = {}, []
     for scene in found.scenes:
         mine = corrections_in(scene.name, given)

@@ -1,4 +1,13 @@
-from .column_names import Clock, Columns, TableImport, meaning, pairs, seconds_of_dates, understood
+from .column_names import (
+    Clock,
+    Columns,
+    TableImport,
+    meaning,
+    option_text,
+    pairs,
+    seconds_of_dates,
+    understood,
+)
 from .columns import (
     BOX,
     COLUMNS,
@@ -50,6 +59,7 @@ __all__ = [
     "idle_lanes",
     "idle_rules",
     "meaning",
+    "option_text",
     "pairs",
     "raw_table",
     "scenes_of",

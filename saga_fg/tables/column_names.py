@@ -217,6 +217,10 @@ class Columns:
     open: Mapping[str, str] = field(default_factory=dict)
 
 
+COMMAND = "--"
+"""Stands for options of the command, where another text names an argument of a program."""
+
+
 def canonical(name: str) -> str | None:
     """Our name of a column by ours or an alias, without a unit; None for one that has no meaning."""
     plain = _plain(name)
@@ -240,13 +244,19 @@ def understood(
     required: Collection[str],
     given: Mapping[str, str],
     lenient: bool = False,
+    within: str = COMMAND,
 ) -> Columns:
     """Find the columns of a file by their names; faults are all that are missing, misspelt, or could be either of two.
 
     names     of the file
     columns   of ours that have a meaning in it; required: those of them that it must have
     given     by our name, the file's name, "" for none; lenient: they need not be there
+    within    as of `option_text`, for what mends a fault
     """
+
+    def naming(columns: Mapping[str, str]) -> str:
+        return option_text({"columns": columns}, within)
+
     chosen: dict[str, str] = {}
     faults: list[str] = []
     mends: dict[str, str] = {}
@@ -255,7 +265,7 @@ def understood(
             chosen[ours] = name
         elif name and ours in columns and not lenient:
             mends[ours] = FILL_IN
-            faults.append(f"--columns {ours}={name[:40]}: there is no column {name[:40]!r}")
+            faults.append(f"{naming({ours: name[:40]})}: there is no column {name[:40]!r}")
     taken = set(chosen.values())
     free = [name for name in names if name not in taken]
     for name in free:
@@ -272,9 +282,8 @@ def understood(
         else:
             mends[ours] = FILL_IN
             either = " or ".join(repr(name[:40]) for name in sorted(candidates))
-            faults.append(
-                f"{ours}: expected one column, {either} could be it; choose: --columns {ours}={candidates[0]}"
-            )
+            mend = naming({ours: candidates[0]})
+            faults.append(f"{ours}: expected one column, {either} could be it; choose: {mend}")
     doubtful = {name for candidates in possible.values() for name in candidates}
     unread = sorted(set(names) - set(chosen.values()) - doubtful)
     for name in unread:
@@ -283,7 +292,7 @@ def understood(
             nearest = get_close_matches(name, free_columns, n=1, cutoff=0.75)
             if nearest:
                 mends[nearest[0]] = name
-                mend = f"--columns {nearest[0]}={name[:40]}, or {nearest[0]}= if it is another"
+                mend = f"{naming({nearest[0]: name[:40]})}, or {naming({nearest[0]: ''})} if it is another"
                 faults.append(f"unknown column {name[:40]!r}; did you mean {nearest[0]!r}? ({mend})")
     missing = [ours for ours in required if ours not in chosen and ours not in possible]
     if missing:
@@ -291,7 +300,7 @@ def understood(
         there = ", ".join(name[:40] for name in sorted(names)[:12]) or "none"
         there += f", ... ({len(names)} in all)" if len(names) > 12 else ""
         wanted = " and ".join(f"a column {ours!r}" for ours in missing)
-        mend = f"; name it: --columns {','.join(f'{ours}=NAME' for ours in missing)}" if names else ""
+        mend = f"; name it: {naming(dict.fromkeys(missing, 'NAME'))}" if names else ""
         faults.insert(0, f"expected {wanted}, the columns there are {there}{mend}")
     ends = {ours: meaning(name) for ours, name in chosen.items()}
     units = {
@@ -300,6 +309,21 @@ def understood(
         if found is not None and found[1] and kind_of.get(found[0]) == kind_of.get(ours)
     }
     return Columns(chosen, units, tuple(unread), tuple(faults), mends)
+
+
+def option_text(entries: Mapping[str, Any], within: str = COMMAND) -> str:
+    """Entries of a `TableImport` as options of the command, or as arguments of a program.
+
+    within: the argument that is a `TableImport`, "" where the entries are arguments themselves
+    """
+    if within != COMMAND:
+        arguments = ", ".join(f"{name}={value!r}" for name, value in entries.items())
+        return f"{within}=TableImport({arguments})" if within else arguments
+    texts = {
+        name: value if isinstance(value, str) else ",".join(f"{a}={b}" for a, b in value.items())
+        for name, value in entries.items()
+    }
+    return " ".join(f"--{name} {shlex.quote(text)}" for name, text in texts.items() if text)
 
 
 def _plain(name: str) -> str:
@@ -392,14 +416,11 @@ class TableImport(Settings):
 
         return {name: mended(name, unit) if _kind(name) == "angle" else unit for name, unit in units.items()}
 
-    def changes(self, mend: Mend, names: Mapping[str, str]) -> dict[str, Any]:
-        """The entries that mend a suspicion, in place of those of the same name; `names` as of `mended`."""
+    def option_for(self, mend: Mend, names: Mapping[str, str], within: str = COMMAND) -> str:
+        """The options that mend a suspicion, in place of those of the same name; `within` as of `option_text`."""
         mended = self.mended(mend, names)
-        return {field.name: getattr(mended, field.name) for field in fields(Mend) if getattr(mend, field.name)}
-
-    def option_for(self, mend: Mend, names: Mapping[str, str]) -> str:
-        """The options of the command that mend a suspicion, in place of those of the same name."""
-        return TableImport(**self.changes(mend, names)).options().strip()
+        entries = {each.name: getattr(mended, each.name) for each in fields(Mend) if getattr(mend, each.name)}
+        return option_text(entries, within)
 
     def _mends(self, mend: Mend) -> bool:
         """False where a suspicion stays although these options say all that mends it."""
@@ -418,12 +439,8 @@ class TableImport(Settings):
 
     def options(self) -> str:
         """The options of the command that say the same, with a space before each; empty if there are none."""
-        text = ""
-        for name in ("columns", "classes", "units"):
-            pairs = ",".join(f"{ours}={theirs}" for ours, theirs in getattr(self, name).items())
-            text += f" --{name} {shlex.quote(pairs)}" if pairs else ""
-        text += f" --coordinates {self.coordinates}" if self.coordinates else ""
-        return text + " --sort" * self.sort + " --as-given" * self.as_given
+        text = option_text({field.name: getattr(self, field.name) for field in fields(Mend)})
+        return f" {text}" * bool(text) + " --sort" * self.sort + " --as-given" * self.as_given
 
     def values(self) -> dict[str, Any]:
         """The values that differ from the default, for a record."""

@@ -15,6 +15,7 @@ import numpy as np
 from saga_fg.errors import InputError
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray, checked_quaternions, quaternion_rotation, yaw_of
 from saga_fg.tables.column_names import (
+    COMMAND,
     ISO,
     Clock,
     Columns,
@@ -77,7 +78,8 @@ class RawTable:
     """Columns of N values each, by our names; `where(row)` says where in the file a row is.
 
     A value is text, a number, or None for one that was left out; with `numerals`, numbers come as text. `found` has the
-    file's names and units, `how` what was asked for, `clock` the unit of times. Numbers come out in s, m, m/s and rad.
+    file's names and units, `how` what was asked for, `clock` the unit of times, `within` how options are named, as of
+    `option_text`. Numbers come out in s, m, m/s and rad.
     """
 
     path: Path
@@ -88,6 +90,7 @@ class RawTable:
     found: Columns = field(default_factory=Columns)
     how: TableImport = field(default_factory=TableImport)
     clock: Clock = field(default_factory=Clock)
+    within: str = COMMAND
     _read: dict[str, FloatArray] = field(default_factory=dict)
 
     def fault(self, row: int, what: str) -> InputError:

@@ -10,7 +10,7 @@ import numpy as np
 
 from saga_fg.errors import InputError, error_context, require_type, unknown_name
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray, from_upper_triangle, yaw_transform
-from saga_fg.tables.column_names import Clock, TableImport, understood
+from saga_fg.tables.column_names import Clock, TableImport, option_text, understood
 from saga_fg.tables.columns import (
     BOX,
     COLUMNS,
@@ -269,10 +269,12 @@ def raw_table(
     how: TableImport | None = None,
     columns: Sequence[str] = COLUMNS,
     required: Sequence[str] = REQUIRED,
+    within: str = "how",
 ) -> RawTable:
     """Return the columns of a table that have a meaning among `columns`, in order of time if they have times.
 
-    how: what it takes to understand it; what is left out is found by the names of the columns
+    how     what it takes to understand it; what is left out is found by the names of the columns
+    within  the argument of the program that is `how`, "" where its entries are arguments themselves
 
     Raises `InputError` for something else, and for columns that are missing, misspelt, or could be either of two.
     """
@@ -289,7 +291,7 @@ def raw_table(
         raise InputError(f"{NAME}: expected every column once: {str(error).splitlines()[0]}") from error
     how = TableImport() if how is None else how
     require_type("how", how, TableImport)
-    found = understood(names, columns, required, how.columns)
+    found = understood(names, columns, required, how.columns, within=within)
     if found.faults:
         raise InputError(f"{NAME}: {'; '.join(found.faults)}")
     index, clock = nw.maybe_get_index(frame), None
@@ -304,7 +306,7 @@ def raw_table(
     def where(row: int) -> str:
         return f"row {row if index is None else index[row]}"
 
-    raw = RawTable(Path(NAME), values, len(frame), where, False, found, how)
+    raw = RawTable(Path(NAME), values, len(frame), where, False, found, how, within=within)
     raw = replace(raw, clock=clock or (clock_of(raw) if len(frame) else Clock()))
     return sorted_by_time(raw) if "timestamp" in values and len(frame) else raw
 
@@ -342,19 +344,19 @@ def tell(findings: Sequence[Finding], raw: RawTable, depth: int) -> None:
 
     Raises `InputError` for all that contradicts how it is read, with the arguments that mend it.
     """
-    how, names = raw.how, raw.found.names
+    how, names, within = raw.how, raw.found.names, raw.within
     known = {finding.kind: finding for finding in reversed(findings)}
     found = []
     for each in known.values():
-        changes = {} if each.mend is None else how.changes(each.mend, names)
-        option = ", ".join(f"{name}={value!r}" for name, value in changes.items())
+        option = "" if each.mend is None else how.option_for(each.mend, names, within)
         found.append(replace(each, what=each.what.removeprefix(f"{NAME}: "), option=option))
-    refuse_contradictions(found, "as_given=True")
+    refuse_contradictions(found, option_text({"as_given": True}, within))
     for each in found:
         warnings.warn(str(each), stacklevel=depth)
     if raw.clock.guessed:
         unit = raw.clock.unit
-        warnings.warn(f"times are read as {unit}, by their size; units={{'time': {unit!r}}} says so", stacklevel=depth)
+        says = option_text({"units": {"time": unit}}, within)
+        warnings.warn(f"times are read as {unit}, by their size; {says} says so", stacklevel=depth)
 
 
 def table_like(table: Table, parts: Sequence[Mapping[str, Any]]) -> Table:

@@ -141,7 +141,7 @@ def track(
     whose contents contradict how it is read: units of angles, times, lengths or speeds, coordinates, exchanged columns.
     """
     how = TableImport(columns or {}, classes or {}, units or {}, coordinates, as_given=as_given)
-    found = read_scenes(detections, how, settings, sensors)
+    found = read_scenes(detections, how, settings, sensors, "")
     parts = []
     for scene in found.scenes:
         tracker = found.new_tracker()
@@ -178,7 +178,7 @@ def predict(
     """
     how = TableImport(columns or {}, classes or {}, units or {}, coordinates, as_given=as_given)
     ahead, wanted = checked_horizons(horizons), None if times is None else np.sort(checked("times", times, (None,)))
-    found = read_scenes(detections, how, settings, sensors)
+    found = read_scenes(detections, how, settings, sensors, "")
     spans = [(scene.frames[0].timestamp, scene.frames[-1].timestamp) for scene in found.scenes]
     for time in [] if wanted is None else wanted.tolist():
         if not any(first <= time <= last for first, last in spans):
@@ -214,13 +214,17 @@ class TableScenes(NamedTuple):
 
 
 def read_scenes(
-    detections: Table, how: TableImport, settings: TrackerSettings | None, sensors: Mapping[str, Sensor] | None
+    detections: Table,
+    how: TableImport,
+    settings: TrackerSettings | None,
+    sensors: Mapping[str, Sensor] | None,
+    within: str,
 ) -> TableScenes:
-    """Read a table. Settings that are left out are those that fit what the first scene looks like.
+    """Read a table, within as of `raw_table`. Settings that are left out are those that fit its first scene.
 
     Warns of those for dense traffic and of what is doubtful, at the caller's caller; raises as `tell`.
     """
-    raw = raw_table(detections, how)
+    raw = raw_table(detections, how, within=within)
     scenes = scenes_of(raw)
     why = seems_dense_traffic(scenes[0].frames) if scenes and settings is None else ""
     if why:

@@ -59,7 +59,7 @@ def test_traps_are_named_and_what_mends_them_gives_the_right_table(subtests):
                     refuse_contradictions(scene.findings)
                 refuse_contradictions(read(made, TableImport(as_given=True)).findings)
                 mend = next(finding.mend for finding in scene.findings if finding.stops)
-                mended = read(made, TableImport(**TableImport().changes(mend, {})))
+                mended = read(made, TableImport().mended(mend, {}))
                 assert mended.findings == ()
                 assert_same(placed(mended), placed(read(right.loc[made.index])))
 

@@ -9,11 +9,13 @@ import subprocess
 import sys
 import threading
 import time
+from typing import Any
 
 import pytest
 
+from pipelines.config import load_config
 from pipelines.serving import StreamClient, parse_address
-from saga_fg import InputError
+from saga_fg import Detection, Detections, Frame, InputError
 from tests.pipelines.command import done, refused
 from tests.pipelines.running_service import COMMAND, frame, serving, status, wait_for
 
@@ -275,3 +277,33 @@ def test_a_client_that_reads_nothing_does_not_hold_up_the_end():
         server.send_signal(signal.SIGTERM)
         server.communicate(timeout=60)
         assert server.returncode == 143
+
+
+def test_settings_for_dense_traffic_are_those_of_track_and_a_file_lies_over_them(tmp_path):
+    """The tracks of a stream are those of the same settings in a program."""
+    frames: list[Any] = [
+        {
+            "timestamp": k / 10,
+            "detections": [{"label": "car", "x": k - 12 * n, "y": 4 * (n % 2), "yaw": 0.0} for n in range(6)],
+        }
+        for k in range(15)
+    ]
+    stream = "\n".join(map(json.dumps, frames)).encode()
+    config = tmp_path / "c.yaml"
+    config.write_text("tracker: {min_hits: 4}\n")
+    cases: Any = [
+        (("--like", "dense"), "dense", None, ""),
+        (("--like", "plain"), "file", None, ""),
+        (("--like", "dense", "--config", config), "dense", config, f"{config}: over the settings of --like dense"),
+    ]
+    for options, family, own, said in cases:
+        command = [*COMMAND, "serve", *map(str, options)]
+        served = subprocess.run(command, input=stream, capture_output=True, check=True)
+        assert served.stderr.decode().count(said or "over the settings") == (said != "")
+        tracker = load_config(family, own).new_tracker("saga")
+        for given, line in zip(frames, served.stdout.splitlines(), strict=True):
+            cars = [Detection(c["label"], (c["x"], c["y"], 0.0), yaw=c["yaw"]) for c in given["detections"]]
+            tracks = tracker.step(Frame(given["timestamp"], "sensor", Detections.of(cars)))
+            answer = json.loads(line)["tracks"]
+            assert [track["id"] for track in answer] == tracks.id.tolist()
+            assert [track["vx"] for track in answer] == pytest.approx(tracks.boxes.velocity[:, 0], abs=1e-3)

@@ -1,6 +1,7 @@
 """`saga_fg.evaluate` and `saga_fg.view`: as the command says, for tables of pandas, Polars and Arrow."""
 
 import json
+import re
 import warnings
 
 import numpy as np
@@ -92,3 +93,59 @@ def test_a_page_shows_tracks_beside_detections_and_truth(tracks, tmp_path):
 def test_labels_say_how_many_they_are():
     labels = saga_fg.smooth(DETECTIONS)
     assert repr(labels).startswith("labels of 1 scenes, 90 boxes")
+
+
+def test_what_mends_a_table_is_named_as_each_function_takes_it(tracks, subtests):
+    """What a stop names, put into the call that stopped, makes it go on."""
+    slow, theirs = (
+        DETECTIONS.assign(timestamp=1e9 * DETECTIONS.timestamp),
+        tracks[["timestamp", "id", "label", "x", "y"]],
+    )
+    late = theirs.assign(timestamp=1e9 * theirs.timestamp)
+    cases = {
+        "track": lambda **how: saga_fg.track(slow, **how),
+        "predict": lambda **how: saga_fg.predict(slow, **how),
+        "smooth": lambda **how: saga_fg.smooth(slow, **how),
+        "frames_of": lambda **how: saga_fg.frames_of(slow, **how),
+        "evaluate": lambda **how: saga_fg.evaluate(late, TRUTH, truth_how=TableImport(), hota=False, **how),
+        "view": lambda **how: saga_fg.view(late, **how),
+        "truth": lambda **how: saga_fg.evaluate(
+            theirs, TRUTH.assign(timestamp=1e9 * TRUTH.timestamp), hota=False, **{"truth_how": TableImport(), **how}
+        ),
+    }
+    for name, call in cases.items():
+        with subtests.test(name):
+            with pytest.raises(InputError, match="as it is") as stopped:
+                call()
+            mend, otherwise = re.search(r"; add (.*); (.*) reads it as it is", str(stopped.value)).groups()
+            names = {"TableImport": TableImport}
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                call(**eval(f"dict({mend})", names))
+            assert {"as_given": True} in (
+                eval(f"dict({otherwise})", names),
+                vars_given(eval(f"dict({otherwise})", names)),
+            )
+
+
+def vars_given(arguments):
+    (how,) = arguments.values()
+    return how.values() if isinstance(how, TableImport) else None
+
+
+def test_a_column_that_is_not_found_is_named_as_the_function_takes_it(tracks):
+    for call, text in [
+        (lambda: saga_fg.track(DETECTIONS.rename(columns={"x": "what"})), "name it: columns={'x': 'NAME'}"),
+        (lambda: saga_fg.smooth(DETECTIONS.rename(columns={"x": "what"})), "how=TableImport(columns={'x': 'NAME'})"),
+        (
+            lambda: saga_fg.evaluate(tracks, TRUTH.rename(columns={"y": "what"}), truth_how=TableImport()),
+            "name it: truth_how=TableImport(columns={'y': 'NAME'})",
+        ),
+    ]:
+        with pytest.raises(InputError, match=re.escape(text)):
+            call()
+
+
+def test_classes_that_have_no_counterpart_are_named_with_the_argument(tracks, caplog):
+    saga_fg.evaluate(tracks, TRUTH.assign(label="AUTO"), hota=False)
+    assert "name them alike: how=TableImport(classes={'AUTO': 'car'})" in caplog.text

@@ -113,7 +113,8 @@ def read_raw_parts(
         if unread:
             names = [name[:40] for name in sorted(unread)]
             more = f", ... ({len(names)} in all)" if len(names) > 12 else ""
-            log.warning("%s: columns without a meaning here, not read: %s", path, ", ".join(names[:12]) + more)
+            text = "%s: columns without a meaning here, not read: %s; --columns OURS=THEIRS reads one"
+            log.warning(text, path, ", ".join(names[:12]) + more)
         told |= unread
         table = replace(table, clock=clock or Clock())
         yield sorted_by_time(table) if how.sort else table

@@ -160,7 +160,7 @@ class McapRecording:
                 raise InputError(f"expected transforms (/tf) between the frames {', '.join(used)}, there are none")
             world = self.options.world or (used or ["world"])[0]
             log.warning(
-                "%s: no transforms (/tf) and no odometry: frame %s is taken for one that stands still",
+                "%s: no transforms (/tf) and no --odometry: frame %s (--world) is taken for one that stands still",
                 self._recording.path,
                 world,
             )

@@ -95,7 +95,8 @@ def test_all_columns_that_are_wrong_are_named_at_once(tmp_path):
         "name it: --columns timestamp=NAME,y=NAME",
         "--columns score=sure: there is no column 'sure'",
         "x: expected one column, 'cx' or 'pos_x' could be it",
-        "unknown column 'lenght'; did you mean 'length'? (--columns length=lenght, or length= if it is another)",
+        "unknown column 'lenght'; did you mean 'length'? "
+        "(--columns length=lenght, or --columns length= if it is another)",
     ):
         assert part in text
 
