@@ -7,7 +7,8 @@ Every fenced block of bash or Python is preceded by a comment that says what bec
     <!-- ci -->                     .ci/run runs it, with `--mark ci`, in the root of the repository
     <!-- not run: REASON -->        it is not run
 
-The cells of a notebook (.ipynb) are one such block, which is run.
+The cells of a notebook (.ipynb) are one such block, which is run. `--write-outputs` runs them one by one and writes
+into the notebook what they print and show, without pages larger than `LARGEST`.
 
 The blocks of a page run in order in one temporary folder, bash with `set -euo pipefail`, Python in a fresh interpreter.
 With `--jobs N`, so many pages run at a time, and a block's output is printed when it has ended.
@@ -16,6 +17,8 @@ With `--jobs N`, so many pages run at a time, and a block's output is printed wh
 from __future__ import annotations
 
 import argparse
+import ast
+import io
 import json
 import os
 import re
@@ -25,12 +28,15 @@ import tempfile
 import time
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 FENCE = re.compile(r"(?:<!-- (?P<mark>[^\n]*?) -->\n)?^```(?P<language>bash|python)\n(?P<code>.*?)^```$", re.M | re.S)
 MARKS = ("run", "run with recordings", "ci")
+LARGEST = 20_000  # characters of an output in a notebook
 
 
 @dataclass(frozen=True)
@@ -98,13 +104,47 @@ def run_page(page: Path, wanted: Iterable[str], environment: dict[str, str], cap
     return failed
 
 
+def write_outputs(page: Path) -> None:
+    """Run the cells of a notebook, and write what they print, and the value of a last expression, into it."""
+    notebook, names = json.loads(page.read_text(encoding="utf-8")), {"__name__": "__main__"}
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    for number, cell in enumerate(cells, start=1):
+        printed, value = io.StringIO(), None
+        body = ast.parse("".join(cell["source"])).body
+        last = body.pop() if isinstance(body[-1], ast.Expr) else None
+        with redirect_stdout(printed):
+            exec(compile(ast.Module(body, []), str(page), "exec"), names)
+            if isinstance(last, ast.Expr):
+                value = eval(compile(ast.Expression(last.value), str(page), "eval"), names)
+        text = printed.getvalue().splitlines(keepends=True)
+        stream = [{"name": "stdout", "output_type": "stream", "text": text}] if text else []
+        cell |= {"execution_count": number, "outputs": [*stream, *_shown(value, number)]}
+    page.write_text(json.dumps(notebook, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _shown(value: Any, number: int) -> list[dict[str, Any]]:
+    """The output of a cell whose last expression has this value, as text and as HTML."""
+    if value is None:
+        return []
+    texts = {"text/plain": repr(value)}
+    if hasattr(value, "_repr_html_"):
+        texts["text/html"] = value._repr_html_()
+    data = {kind: text.splitlines(keepends=True) for kind, text in texts.items() if len(text) <= LARGEST}
+    return [{"data": data, "execution_count": number, "metadata": {}, "output_type": "execute_result"}]
+
+
 def main() -> int:
     """Run the pages named on the command line; 1 if a block failed."""
     parser = argparse.ArgumentParser(description="Run the examples of the documentation.")
     parser.add_argument("pages", nargs="+", type=Path)
     parser.add_argument("--mark", choices=MARKS, help="only blocks marked so (default: all but ci)")
     parser.add_argument("--jobs", type=int, default=1, help="pages to run at a time (default: 1)")
+    parser.add_argument("--write-outputs", action="store_true", help="write the outputs of notebooks into these")
     arguments = parser.parse_args()
+    if arguments.write_outputs:
+        for page in arguments.pages:
+            write_outputs(page)
+        return 0
     environment = dict(os.environ)
     beside = ROOT.parent / "shared" / "data"
     if "SAGA_FG_DATA" in environment or beside.is_dir():  # as an absolute path: examples run in other folders

@@ -1,5 +1,6 @@
 """The documentation keeps up: settings are complete, examples are marked, links lead somewhere."""
 
+import ast
 import json
 import pkgutil
 import re
@@ -203,6 +204,23 @@ def test_pages_run_at_the_same_time_are_told_apart(tmp_path):
     assert "FAILED" not in run.stdout.replace(f"FAILED {pages[1]}:2: exit code 1", "")
     for page in pages:
         assert re.search(rf"^--- {re.escape(str(page))}:2 \([0-9.]+ s\)\nfrom {page.stem}$", run.stdout, re.M)
+
+
+def test_notebooks_hold_what_their_cells_show(tmp_path, subtests):
+    """Each cell that ends in a value has an output; outputs are written by running the cells."""
+    for path in sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
+        cells = [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
+        for cell in cells:
+            last = ast.parse("".join(cell["source"])).body[-1]
+            shows = isinstance(last, ast.Expr)
+            with subtests.test(f"{path.name}, {cell['id']}"):
+                assert bool(cell["outputs"]) == shows
+    small = {"cell_type": "code", "metadata": {}, "execution_count": None, "outputs": []}
+    made = tmp_path / "small.ipynb"
+    made.write_text(json.dumps({"cells": [{**small, "source": ["x = 2\n", "print(x)\n", "x + 1"]}]}))
+    assert run_examples("--write-outputs", made).returncode == 0
+    printed, shown = json.loads(made.read_text())["cells"][0]["outputs"]
+    assert (printed["text"], shown["data"]) == (["2\n"], {"text/plain": ["3"]})
 
 
 def test_ci_runs_the_commands_of_the_readme():
