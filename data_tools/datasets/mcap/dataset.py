@@ -159,11 +159,8 @@ class McapRecording:
             if len(used) > 1:
                 raise InputError(f"expected transforms (/tf) between the frames {', '.join(used)}, there are none")
             world = self.options.world or (used or ["world"])[0]
-            log.warning(
-                "%s: no transforms (/tf) and no --odometry: frame %s (--world) is taken for one that stands still",
-                self._recording.path,
-                world,
-            )
+            text = "%s: no transforms (/tf), no --odometry: frame %s is taken for one that stands still (or --world)"
+            log.warning(text, self._recording.path, world)
             return Places(world, None, np.ones(len(time), dtype=bool), {})
         first = {objects.frame: f"{m.topic.name}: message {m.number}" for m, objects in reversed(seen)}
         for frame in (*used, *([self.options.world] if self.options.world else [])):
