@@ -26,7 +26,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import chain, islice
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -40,7 +40,6 @@ from saga_fg.numerics import (
     FloatArray,
     StrArray,
     from_upper_triangle,
-    upper_triangle,
 )
 from saga_fg.tables import (
     LABEL_COLUMNS,
@@ -82,32 +81,12 @@ def write_tracks(path: str | Path, scenes: Iterable[tuple[Scene, Sequence[Tracks
     `scenes` may be a generator: the file appears when all is done; numbers are written in full. Raises `InputError` for
     another suffix, a path that is not writable, and tracks that do not fit the scene.
     """
-    rows = (
-        _rows(str(path), scene, moments, [int(settled) for tracks in moments for settled in tracks.settled])
-        for scene, moments in scenes
-    )
-    write_rows(path, (*TRACK_COLUMNS, SETTLED), chain.from_iterable(rows))
+    _write_scenes(path, scenes, (*TRACK_COLUMNS, SETTLED))
 
 
 def write_label_table(path: str | Path, scenes: Iterable[tuple[Scene, Sequence[Labels]]]) -> None:
     """Write the labels of some scenes, each with one `Labels` for each of its timestamps; else as `write_tracks`."""
-    rows = (
-        _rows(
-            str(path),
-            scene,
-            [labels.tracks for labels in frames],
-            *(
-                [value for labels in frames for value in getattr(labels, name).tolist()]
-                for name in ("yaw_variance", "source", "quality")
-            ),
-            *(
-                [value for labels in frames for value in labels.probability.table_columns()[name].tolist()]
-                for name in PROBABILITIES
-            ),
-        )
-        for scene, frames in scenes
-    )
-    write_rows(path, LABEL_COLUMNS, chain.from_iterable(rows))
+    _write_scenes(path, scenes, LABEL_COLUMNS)
 
 
 def write_review(path: str | Path, reviews: Mapping[str, Review]) -> None:
@@ -121,20 +100,23 @@ def write_review(path: str | Path, reviews: Mapping[str, Review]) -> None:
     write_rows(path, REVIEW_COLUMNS, sorted(rows, key=lambda row: -row[1]))
 
 
-def _rows(path: str, scene: Scene, moments: Sequence[Tracks], *further: list[Any]) -> Iterator[list[Any]]:
-    """The rows of `TRACK_COLUMNS` and `further` columns of a scene, None for what is unknown; `path` is for errors."""
+def _write_scenes(
+    path: str | Path, scenes: Iterable[tuple[Scene, Sequence[Tracks | Labels]]], columns: tuple[str, ...]
+) -> None:
+    rows = (row for scene, moments in scenes for row in _rows(str(path), scene, moments, columns))
+    write_rows(path, columns, rows)
+
+
+def _rows(path: str, scene: Scene, moments: Sequence[Tracks | Labels], columns: tuple[str, ...]) -> Iterator[list[Any]]:
+    """The rows of a scene, None for what is unknown; `path` is for errors."""
     if len(moments) != len(scene):
         raise InputError(f"{path}: scene {scene.name}: expected tracks for {len(scene)} moments, got {len(moments)}")
-    if not len(scene):
-        return
-    tracks, times = Tracks.concatenate(moments), np.repeat(scene.timestamps, [len(each) for each in moments])
-    boxes = tracks.boxes
-    spreads = [upper_triangle(P) for P in (tracks.position_covariance, tracks.velocity_covariance)]
-    places = (boxes.position, boxes.size, boxes.yaw, boxes.velocity)
-    numbers = np.column_stack([*places, tracks.score, *spreads, tracks.coasting]).tolist()
-    names = times.tolist(), tracks.id.tolist(), boxes.label.tolist()
-    for time, id_, label, row, *more in zip(*names, numbers, *further, strict=True):
-        yield [scene.name, time, id_, label, *(None if value != value else value for value in (*row, *more))]
+    for time, moment in zip(scene.timestamps.tolist(), moments, strict=True):
+        table = moment.table_columns()
+        n = len(table["id"])
+        table |= {"scene": np.full(n, scene.name), "timestamp": np.full(n, time), SETTLED: table[SETTLED].astype(int)}
+        for row in zip(*(table[name].tolist() for name in columns), strict=True):
+            yield [None if value != value else value for value in row]
 
 
 def write_rows(path: str | Path, columns: tuple[str, ...], rows: Iterable[list[Any]]) -> None:
@@ -331,19 +313,14 @@ class PredictionRows(Columns):
     @classmethod
     def from_moments(cls, moments: Sequence[PredictedTracks]) -> Self:
         """The rows of what was predicted at several moments."""
-        none = np.empty(0)
-        empty = cls(none, none, np.empty(0, dtype=np.str_), np.empty((0, 2)), np.empty((0, 2, 2)))
-        return cls.concatenate([empty, *(cls._of_moment(predicted) for predicted in moments)])
-
-    @classmethod
-    def _of_moment(cls, predicted: PredictedTracks) -> Self:
-        h, n = len(predicted.horizons), len(predicted)
+        tables = [each.table_columns() for each in (PredictedTracks.empty(0.0, np.zeros(1)), *moments)]
+        columns = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
         return cls(
-            np.full(h * n, predicted.timestamp),
-            np.repeat(predicted.horizons, n),
-            np.tile(predicted.id.astype(np.str_), h),
-            predicted.position.reshape(-1, 2),
-            predicted.position_covariance.reshape(-1, 2, 2),
+            columns["timestamp"],
+            columns["horizon"],
+            columns["id"].astype(np.str_),
+            np.stack([columns["x"], columns["y"]], axis=-1),
+            from_upper_triangle(np.stack([columns[name] for name in POSITION_COVARIANCE], axis=-1)),
         )
 
 
