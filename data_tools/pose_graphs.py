@@ -39,6 +39,7 @@ from saga_fg.numerics import (
     geometry,
     quaternion_norms,
     quaternion_rotation,
+    refuse,
     rotation_quaternion,
 )
 from saga_fg.slam.pose_graph import (

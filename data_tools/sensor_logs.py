@@ -23,7 +23,7 @@ import numpy as np
 from data_tools.datasets.kitti.dataset import FRAME_PERIOD, read_sensors, world_position
 from data_tools.files import LARGEST, TextTable, read_lines
 from saga_fg.errors import InputError
-from saga_fg.numerics import FloatArray, checked
+from saga_fg.numerics import FloatArray, checked, refuse
 from saga_fg.slam.sensors import SensorBuffer, SensorName, SensorSettings
 from saga_fg.types import EgoMeasurements
 
@@ -88,10 +88,11 @@ def read_sensor_log(
     units = [_UNITS[name][found[name][1]] for name in wanted]
     most = tuple(_MOST[name] / unit if name in _MOST else LARGEST for name, unit in zip(wanted, units, strict=True))
     numbers = table.numbers([found[name][0] for name in wanted], wanted, most) * units
-    backwards = np.flatnonzero(np.diff(numbers[:, 0]) <= 0)
-    if len(backwards):
-        at = int(backwards[0]) + 1
-        raise table.fault(at, f"time: expected one after {numbers[at - 1, 0]:.6f} s, got {numbers[at, 0]:.6f} s")
+    time = numbers[:, 0]
+    refuse(
+        np.diff(time, prepend=-np.inf) <= 0,
+        lambda row: table.fault(row, f"time: expected one after {time[row - 1]:.6f} s, got {time[row]:.6f} s"),
+    )
     if names == _GEODETIC and len(numbers):
         degrees = numbers[:, 1:] * [180 / math.pi, 180 / math.pi, 1.0]
         begin = degrees[0] if origin is None else np.array(origin())
@@ -162,12 +163,9 @@ def kitti_sensor_log(path: str | Path, sensors: tuple[SensorName, ...], seed: in
     Inertial samples are those recorded. Fixes and speeds are of the filtered solution that the estimate is compared
     with; so they get noise from `seed`: 1 m by axis, and 0.05 m/s with a scale that is wrong by 1 %.
     """
-    records, rng = read_sensors(path), np.random.default_rng(seed)
-    time = FRAME_PERIOD * np.arange(len(records.position))
-    scale = 1 + rng.choice([-0.01, 0.01])
-    noisy: dict[SensorName, FloatArray] = {
-        "imu": np.hstack([records.acceleration, records.angular_rate]),
-        "wheels": (scale * records.speed + rng.normal(0, _WHEELS_NOISE, len(time)))[:, None],
-        "gps": records.position + rng.normal(0, _GPS_NOISE, (len(time), 3)),
-    }
-    return SensorLog({name: np.column_stack([time, noisy[name]]) for name in sensors})
+    measured, rng = read_sensors(path), np.random.default_rng(seed)
+    time = FRAME_PERIOD * np.arange(len(measured["gps"]))
+    measured["wheels"] = (1 + rng.choice([-0.01, 0.01])) * measured["wheels"]
+    measured["wheels"] += rng.normal(0, _WHEELS_NOISE, (len(time), 1))
+    measured["gps"] = measured["gps"] + rng.normal(0, _GPS_NOISE, (len(time), 3))
+    return SensorLog({name: np.column_stack([time, measured[name]]) for name in sensors})

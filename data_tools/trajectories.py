@@ -62,6 +62,7 @@ from saga_fg.numerics import (
     is_rotation,
     quaternion_norms,
     quaternion_rotation,
+    refuse,
 )
 
 __all__ = [
@@ -102,17 +103,15 @@ class Trajectory:
         poses = checked("world_T_ego", self.world_T_ego, (len(timestamps), 4, 4))
         if not len(timestamps):
             raise InputError("timestamps: expected at least one pose")
-        late = np.diff(timestamps) <= 0
-        if late.any():
-            k = int(np.argmax(late)) + 1
-            raise InputError(
-                f"timestamps[{k}]: expected increasing times, got {timestamps[k]:.6f} s after {timestamps[k - 1]:.6f} s"
-            )
+        late = "timestamps[{}]: expected increasing times, got {:.6f} s after {:.6f} s"
+        refuse(
+            np.diff(timestamps, prepend=-np.inf) <= 0,
+            lambda k: InputError(late.format(k, timestamps[k], timestamps[k - 1])),
+        )
         askew = ~is_rotation(poses[:, :3, :3], _ORTHONORMAL)
         askew |= (np.abs(poses[:, 3] - [0, 0, 0, 1]) > 1e-9).any(axis=1)
-        if askew.any():
-            k = int(np.argmax(askew))
-            raise InputError(f"world_T_ego[{k}]: expected a rigid transform (orthonormal rotation, last row 0 0 0 1)")
+        expected = "expected a rigid transform (orthonormal rotation, last row 0 0 0 1)"
+        refuse(askew, lambda k: InputError(f"world_T_ego[{k}]: {expected}"))
         object.__setattr__(self, "timestamps", timestamps)
         object.__setattr__(self, "world_T_ego", poses)
 
@@ -326,9 +325,8 @@ def read_tum_poses(path: str | Path) -> Trajectory:
         raise InputError(f"{path}: expected a pose per line, there is none")
     numbers = table.numbers(slice(0, 8), _TUM_COLUMNS)
     norm = quaternion_norms(numbers[:, 4:])
-    if (np.abs(norm - 1) > _UNIT).any():
-        row = int(np.argmax(np.abs(norm - 1) > _UNIT))
-        raise table.fault(row, f"qx qy qz qw: expected a unit quaternion, got norm {norm[row]:.6g}")
+    expected = "qx qy qz qw: expected a unit quaternion"
+    refuse(np.abs(norm - 1) > _UNIT, lambda row: table.fault(row, f"{expected}, got norm {norm[row]:.6g}"))
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     poses[:, :3, :3] = quaternion_rotation(numbers[:, [7, 4, 5, 6]] / norm[:, None])
     poses[:, :3, 3] = numbers[:, 1:4]

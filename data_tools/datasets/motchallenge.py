@@ -38,7 +38,7 @@ from data_tools.metrics import SceneBoxes
 from data_tools.metrics.hota import SceneSimilarities, image_overlaps, similarity_metrics
 from saga_fg.errors import InputError, error_context
 from saga_fg.model import GroundCamera
-from saga_fg.numerics import FloatArray, IntArray
+from saga_fg.numerics import FloatArray, IntArray, refuse
 from saga_fg.types import Annotations, Frame, Scene, Tracks
 
 if TYPE_CHECKING:
@@ -78,12 +78,8 @@ class ImageRows:
             raise InputError(f"{expected}; got {rows.shape[1]}")
         bad = ~np.isfinite(rows).all(axis=1) | (rows[:, 0] < 1) | (rows[:, :2] != np.rint(rows[:, :2])).any(axis=1)
         bad |= (rows[:, 4:6] <= 0).any(axis=1) | (np.abs(rows[:, :6]) > LARGEST).any(axis=1)
-        if bad.any():
-            row = int(np.argmax(bad))
-            what = (
-                f"a whole frame from 1 on, a whole id, and a box of a width and height above 0, all within {LARGEST:g}"
-            )
-            raise InputError(f"{path}: row {row + 1}: expected {what}, got {rows[row].tolist()}")
+        what = f"a whole frame from 1 on, a whole id, and a box of a width and height above 0, all within {LARGEST:g}"
+        refuse(bad, lambda row: InputError(f"{path}: row {row + 1}: expected {what}, got {rows[row].tolist()}"))
         rows = rows[np.argsort(rows[:, 0], kind="stable")]
         xyxy = np.concatenate([rows[:, 2:4], rows[:, 2:4] + rows[:, 4:6]], axis=1)
         return cls(rows[:, 0].astype(np.int64) - 1, rows[:, 1].astype(np.int64), xyxy, rows[:, 6:])

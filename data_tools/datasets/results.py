@@ -14,7 +14,7 @@ from data_tools.datasets.detection_files import TableImport, TrackRows
 from data_tools.metrics import SceneBoxes
 from data_tools.metrics.misalignment import misalignment
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics import FloatArray, IntArray
+from saga_fg.numerics import FloatArray, IntArray, refuse
 from saga_fg.tables import NAME, option_text, usual_class
 from saga_fg.types import Dataset, Mend, Scene, known_velocities
 
@@ -220,11 +220,8 @@ def scene_result(scene: Scene, rows: TrackRows, path: str | Path) -> SceneResult
     moment = np.searchsorted(scene.timestamps, rows.timestamp[mine] - _SAME_TIME)
     at = np.minimum(moment, len(scene) - 1)
     strange = np.abs(scene.timestamps[at] - rows.timestamp[mine]) > _SAME_TIME
-    if strange.any():
-        time = rows.timestamp[mine][np.argmax(strange)]
-        raise InputError(
-            f"{path}: scene {scene.name}: expected the times of the detections, they have none at {time} s"
-        )
+    expected = f"{path}: scene {scene.name}: expected the times of the detections"
+    refuse(strange, lambda row: InputError(f"{expected}, they have none at {rows.timestamp[mine[row]]} s"))
     order = np.argsort(moment, kind="stable")
     chosen = mine[order]
     boxes = rows.boxes.select(chosen)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from data_tools.files.file_access import open_bytes, open_text, read_text
 from data_tools.files.isolated_reading import isolated
 from saga_fg.errors import InputError, MissingExtraError, error_context
-from saga_fg.numerics import BoolArray, FloatArray
+from saga_fg.numerics import BoolArray, FloatArray, refuse
 
 LONGEST = 100  # characters of a value
 LARGEST = 1e15  # largest number; its square does not overflow
@@ -89,16 +89,13 @@ class TextTable:
             whole = [_whole(value) for value in text.tolist()]
             bad = np.array([value is None or not smallest <= value <= largest for value in whole])
             numbers = np.array([0 if wrong else value for value, wrong in zip(whole, bad, strict=True)], dtype=np.int64)
-        if bad.any():
-            row = int(np.argmax(bad))
-            raise self.fault(row, f"{name}: expected a whole number from {smallest} to {largest}, got {text[row][:40]}")
+        expected = f"{name}: expected a whole number from {smallest} to {largest}"
+        refuse(bad, lambda row: self.fault(row, f"{expected}, got {text[row][:40]}"))
         return numbers
 
     def check(self, good: BoolArray, what: Callable[[int], str]) -> None:
         """Raise `InputError` about the first row that is not good (N,); what: says what is wrong with a row."""
-        if not good.all():
-            row = int(np.argmin(good))
-            raise self.fault(row, what(row))
+        refuse(~good, lambda row: self.fault(row, what(row)))
 
     def fault(self, row: int, what: str) -> InputError:
         """An error about one row."""

@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from saga_fg.errors import InputError
-from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, checked, checked_labels
+from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray, checked, checked_labels, refuse
 from saga_fg.types import Annotations, Boxes, Tracks
 
 
@@ -112,10 +112,10 @@ class SceneBoxes(Columns):
         names = checked_labels("id", self.id, n)
         _, numbers = np.unique(names, return_inverse=True)
         key = numbers * (frame[-1] + 1 if n else 1) + frame
-        unique, first = np.unique(key, return_index=True)
-        if len(unique) != n:
-            row = int(np.setdiff1d(np.arange(n), first)[0])
-            raise InputError(f"id[{row}]: expected unique ids, {str(names[row])!r} occurs twice in frame {frame[row]}")
+        again = np.ones(n, dtype=np.bool_)
+        again[np.unique(key, return_index=True)[1]] = False
+        twice = "id[{}]: expected unique ids, {!r} occurs twice in frame {}"
+        refuse(again, lambda row: InputError(twice.format(row, str(names[row]), frame[row])))
         for name, array in (("frame", frame), ("id", names), ("score", checked("score", self.score, (n,)))):
             object.__setattr__(self, name, array)
         given = self.position_covariance if len(self.position_covariance) else np.full((n, 2, 2), np.nan)

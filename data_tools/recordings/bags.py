@@ -293,10 +293,9 @@ class _Bag:
                 raise InputError(f"{where} {int(np.argmin(known)) + 1}: expected finite numbers")
             new = np.diff(time, prepend=-np.inf)  # some are sent twice
             if (new < 0).any():
-                before, now = time[int(np.argmax(new < 0)) - 1 :][:2].tolist()
-                raise InputError(
-                    f"{where} {int(np.argmax(new < 0)) + 1}: time: expected one after {before:.6f} s, got {now:.6f} s"
-                )
+                row = int(np.argmax(new < 0))
+                expected = f"time: expected one after {time[row - 1]:.6f} s"
+                raise InputError(f"{where} {row + 1}: {expected}, got {time[row]:.6f} s")
             found[name] = np.column_stack([time, table])[new > 0]
         return found
 

@@ -167,31 +167,22 @@ class SimulatedTraffic:
         for name, value, least in (("scenes", scenes, 1), ("seed", seed, 0)):
             if value < least:
                 raise InputError(f"{name}: expected a number of at least {least}, got {value}")
-        self._settings = settings or SimulatorSettings()
+        self.settings = settings or SimulatorSettings()
         self._seeds = {
             f"scene-{k + 1:04d}": int(np.random.SeedSequence([seed, k]).generate_state(1)[0]) for k in range(scenes)
         }
-
-    @property
-    def settings(self) -> SimulatorSettings:
-        """The settings of all scenes."""
-        return self._settings
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        """The names of the scenes."""
-        return tuple(self._seeds)
+        self.scenes = tuple(self._seeds)
 
     @property
     def mounts(self) -> dict[str, tuple[float, float, float]]:
         """Position of each sensor on the vehicle by its name, m."""
-        return {name: sensor.position for name, sensor in self._settings.sensors.items()}
+        return {name: sensor.position for name, sensor in self.settings.sensors.items()}
 
     def scene(self, name: str) -> Scene:
         """Simulate one scene; raises `InputError` for an unknown name."""
         if name not in self._seeds:
             raise InputError(f"scene {name!r}: expected one of {', '.join(self._seeds)}")
-        return simulate_scene(self._settings, self._seeds[name], name)
+        return simulate_scene(self.settings, self._seeds[name], name)
 
 
 def scene_from_world(

@@ -7,7 +7,7 @@ number is needed, ever reaches the numerics (or GTSAM, which would crash the int
 """
 
 import weakref
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
@@ -49,6 +49,12 @@ def checked(name: str, value: ArrayLike, shape: tuple[int | None, ...], values: 
             raise InputError(f"{name}{list(where)}: expected {expected}, got {array[where]}")
     array.flags.writeable = False
     return array
+
+
+def refuse(bad: BoolArray | np.bool_, fault: Callable[[int], InputError]) -> None:
+    """Raise the error about the first of the rows (N,) that are bad, if there is one."""
+    if bad.any():
+        raise fault(int(np.argmax(bad)))
 
 
 def unchecked(kind: type[T], **values: Any) -> T:

@@ -13,7 +13,16 @@ from typing import Any
 import numpy as np
 
 from saga_fg.errors import InputError
-from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray, checked_quaternions, quaternion_rotation, yaw_of
+from saga_fg.numerics import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    StrArray,
+    checked_quaternions,
+    quaternion_rotation,
+    refuse,
+    yaw_of,
+)
 from saga_fg.tables.column_names import (
     COMMAND,
     ISO,
@@ -237,10 +246,9 @@ class RawTable:
                 unit = self.how.unit(of, self.found.units.get(of))
                 numbers = numbers if unit is None else in_our_unit(of, numbers, unit, power)
         large = np.abs(numbers) > LIMITS.get(name, sys.float_info.max)
-        if large.any():
-            row = int(np.argmax(large))
-            within = f" within {LIMITS[name]:g}" if np.isfinite(numbers[row]) else ""
-            raise self.fault(row, f"{self.title(name)}: expected a finite number{within}, got {numbers[row]:g}")
+        within = f" within {LIMITS[name]:g}" if name in LIMITS else ""
+        expected = f"{self.title(name)}: expected a finite number{within}"
+        refuse(large, lambda row: self.fault(row, f"{expected}, got {numbers[row]:g}"))
         return numbers
 
     def plain_numbers(self, name: str) -> FloatArray:
@@ -289,11 +297,8 @@ class RawTable:
         yaw = np.full(self.length, np.nan)
         with np.errstate(over="ignore"):  # is odd then
             norm = np.linalg.norm(parts[known], axis=1)
-        odd = np.abs(norm - 1) > 0.01
-        if odd.any():
-            at = int(np.argmax(odd))
-            text = f"{' '.join(names)}: expected a quaternion of length 1, got {norm[at]:g}"
-            raise self.fault(int(known[at]), text)
+        expected = f"{' '.join(names)}: expected a quaternion of length 1"
+        refuse(np.abs(norm - 1) > 0.01, lambda row: self.fault(int(known[row]), f"{expected}, got {norm[row]:g}"))
         unit = checked_quaternions(" ".join(names), parts[known] / norm[:, None])
         yaw[known] = yaw_of(quaternion_rotation(unit))
         return yaw
@@ -354,15 +359,11 @@ class EgoColumns:
             part = given.any(axis=1) & ~given[:, :least].all(axis=1)
             if part.any():
                 row = int(np.argmax(part))
-                missing = names[int(np.argmin(given[row]))]
-                raise raw.fault(
-                    row, f"{missing}: expected a number, since {names[int(np.argmax(given[row]))]} is given"
-                )
+                missing, there = names[int(np.argmin(given[row]))], names[int(np.argmax(given[row]))]
+                raise raw.fault(row, f"{missing}: expected a number, since {there} is given")
             columns.append(values)
-        short = columns[0][:, 3] <= 0
-        if short.any():
-            row = int(np.argmax(short))
-            raise raw.fault(row, f"odometry_dt: expected seconds > 0, got {columns[0][row, 3]:g}")
+        took = columns[0][:, 3]
+        refuse(took <= 0, lambda row: raw.fault(row, f"odometry_dt: expected seconds > 0, got {took[row]:g}"))
         return cls(*columns) if any(np.isfinite(values).any() for values in columns) else None
 
     def measured(self, rows: IntArray) -> EgoMeasurements:

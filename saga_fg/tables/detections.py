@@ -2,14 +2,14 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
 from saga_fg.errors import InputError, error_context, require_type, unknown_name
-from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray, from_upper_triangle, yaw_transform
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray, from_upper_triangle, refuse, yaw_transform
 from saga_fg.tables.column_names import Clock, TableImport, option_text, understood
 from saga_fg.tables.columns import (
     BOX,
@@ -33,58 +33,56 @@ _COORDINATES = ("world", "ego", "sensor", "camera")
 JUDGED = 3  # scenes of a table
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """The checked table: N rows, of which those that are not `empty` hold a detection."""
-
-    raw: RawTable
-    scene: StrArray
-    timestamp: FloatArray
-    sensor: StrArray
-    coordinates: StrArray
-    empty: BoolArray
-    detections: Detections
-    pose: FloatArray | None  # (N, 4): x, y, z, yaw
-    ego: EgoColumns | None
-
-
 class DetectionTable:
     """The scenes of one table of detections; `saga_fg.track` has the columns.
 
     A scene's moments are all times at which some sensor spoke; without pose columns its poses are the identity.
     """
 
-    def __init__(self, table: RawTable, judged: bool = True) -> None:
+    def __init__(self, raw: RawTable, judged: bool = True) -> None:
         """Check everything. Raises `InputError` naming file, row and column.
 
         judged: whether its first scenes are to have their `findings`
         """
-        self._rows, self._judged = _checked(table), judged
-        names, first = np.unique(self._rows.scene, return_index=True)
-        self._scenes = tuple(names[np.argsort(first)].tolist())
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        """The names of the scenes, in the order of the file."""
-        return self._scenes
+        if raw.length == 0:
+            raise InputError(f"{raw.path}: expected at least one row, the table is empty")
+        raw.check_numbers(("timestamp", "x", "y", *BOX, *COVARIANCE, *POSE, *ODOMETRY, *GPS))
+        self._raw, self._judged, self._time = raw, judged, raw.numbers("timestamp")
+        _require(raw, np.isfinite(self._time), "timestamp", self._time, "a finite number of seconds")
+        self._scene, self._sensor = raw.texts("scene", raw.path.stem), raw.texts("sensor", "sensor")
+        _check_order(raw, self._scene, self._time)
+        self._empty = raw.flags("empty") | (~raw.present("x") & ~raw.present("y")) | raw.labels()[1]
+        given = raw.texts("coordinates", raw.how.coordinates or "world")
+        expected = f"coordinates: expected {', '.join(_COORDINATES[:-1])} or {_COORDINATES[-1]}"
+        refuse(~np.isin(given, _COORDINATES), lambda row: raw.fault(row, f"{expected}, got {str(given[row])!r}"))
+        self._ego = EgoColumns.from_table(raw)
+        self._pose = _pose(raw, given, self._ego is not None)
+        of_camera = given == "camera"
+        self._coordinates = np.where(of_camera, "ego", given)
+        found = box_columns(raw, self._empty)
+        boxes = _from_camera(found.boxes, of_camera) if of_camera.any() else found.boxes
+        self._detections = replace(found, boxes=boxes, position_covariance=_covariances(raw, self._empty))
+        self.with_poses = self._pose is not None
+        names, first = np.unique(self._scene, return_index=True)
+        self.scenes: tuple[str, ...] = tuple(names[np.argsort(first)].tolist())
 
     def scene(self, name: str) -> Scene:
         """One of the scenes; raises `InputError` for an unknown name."""
-        path = self._rows.raw.path
-        if name not in self._scenes:
-            raise InputError(f"{path}: {unknown_name('scene', name, self._scenes)}")
-        rows = np.flatnonzero(self._rows.scene == name)
-        times, moment = np.unique(self._rows.timestamp[rows], return_inverse=True)
+        path = self._raw.path
+        if name not in self.scenes:
+            raise InputError(f"{path}: {unknown_name('scene', name, self.scenes)}")
+        rows = np.flatnonzero(self._scene == name)
+        times, moment = np.unique(self._time[rows], return_inverse=True)
         with error_context(f"{path}: scene {name}"):
             poses = self._poses(rows, moment, len(times))
             world_T_ego = np.tile(np.eye(4), (len(times), 1, 1)) if poses is None else poses
             frames, kept, firsts = self._frames(rows, moment, poses)
-            findings = self._findings(frames, kept, firsts) if self._judged and name in self._scenes[:JUDGED] else ()
+            findings = self._findings(frames, kept, firsts) if self._judged and name in self.scenes[:JUDGED] else ()
             return Scene(name, times, world_T_ego, ("",) * len(times), frames, findings=findings)
 
     def _findings(self, frames: list[Frame], rows: IntArray, firsts: IntArray) -> tuple[Finding, ...]:
         """Findings about the table and a scene; rows (N,): of its detections, firsts (F,): first row of each frame."""
-        raw = self._rows.raw
+        raw = self._raw
         ego_yaw = raw.numbers("ego_yaw")[firsts]
         found = [*raw.findings(), *findings_of(Sample.from_frames(frames, raw.numbers("yaw")[rows], ego_yaw))]
         if "coordinates" in raw.columns:  # which no option replaces
@@ -93,97 +91,52 @@ class DetectionTable:
         judged = raw.how.judged(found, raw.found.names)
         return tuple(replace(finding, what=f"{raw.path}: {finding.what}") for finding in judged)
 
-    @property
-    def with_poses(self) -> bool:
-        """True if the table has poses of the vehicle."""
-        return self._rows.pose is not None
-
     def _poses(self, rows: IntArray, moment: IntArray, count: int) -> FloatArray | None:
         """world_T_ego (K, 4, 4) of the moments of a scene, None without pose columns."""
-        if self._rows.pose is None:
+        if self._pose is None:
             return None
-        pose = self._rows.pose[rows]
+        pose = self._pose[rows]
         _, first = np.unique(moment, return_index=True)
         other = (pose != pose[first][moment]).any(axis=1)
-        if other.any():
-            row = int(rows[np.argmax(other)])
-            raise self._rows.raw.fault(row, "ego_x, ego_y, ego_z, ego_yaw: expected one pose at one time, got another")
+        expected = f"{', '.join(POSE)}: expected one pose at one time, got another"
+        refuse(other, lambda row: self._raw.fault(int(rows[row]), expected))
         return np.array([yaw_transform(*pose[k]) for k in first.tolist()]).reshape(count, 4, 4)
 
     def _frames(
         self, rows: IntArray, moment: IntArray, poses: FloatArray | None
     ) -> tuple[list[Frame], IntArray, IntArray]:
         """The frames of a scene, the rows (N,) of their detections in this order, and the first row (F,) of each."""
-        table, kept, firsts = self._rows, [], []
-        sensors, sensor = np.unique(table.sensor[rows], return_inverse=True)
+        kept, firsts, frames = [], [], []
+        sensors, sensor = np.unique(self._sensor[rows], return_inverse=True)
         key = moment * len(sensors) + sensor
         order = np.argsort(key, kind="stable")
         starts = np.flatnonzero(np.diff(key[order], prepend=-1))
-        frames = []
         for group in np.split(order, starts[1:]):
-            k = int(moment[group[0]])
-            members = rows[group]
-            kind = table.coordinates[members]
-            if (kind != kind[0]).any():
-                row = int(members[np.argmax(kind != kind[0])])
-                raise table.raw.fault(row, "coordinates: expected the same in all rows of a frame")
-            kept.append(members[~table.empty[members]])
+            k, members = int(moment[group[0]]), rows[group]
+            kind = self._coordinates[members]
+            other = members[kind != kind[0]]
+            if len(other):
+                raise self._raw.fault(int(other[0]), "coordinates: expected the same in all rows of a frame")
+            kept.append(members[~self._empty[members]])
             firsts.append(members[0])
             frames.append(
                 Frame(
-                    timestamp=float(table.timestamp[members[0]]),
-                    sensor=str(table.sensor[members[0]]),
-                    detections=table.detections.select(kept[-1]),
+                    timestamp=float(self._time[members[0]]),
+                    sensor=str(self._sensor[members[0]]),
+                    detections=self._detections.select(kept[-1]),
                     world_T_ego=None if poses is None else poses[k],
                     coordinates=cast(Coordinates, str(kind[0])),
-                    ego=None if table.ego is None else table.ego.measured(members),
+                    ego=None if self._ego is None else self._ego.measured(members),
                 )
             )
         return frames, np.concatenate(kept), np.array(firsts)
 
 
-def _checked(raw: RawTable) -> _Rows:
-    if raw.length == 0:
-        raise InputError(f"{raw.path}: expected at least one row, the table is empty")
-    raw.check_numbers(("timestamp", "x", "y", *BOX, *COVARIANCE, *POSE, *ODOMETRY, *GPS))
-    timestamp = raw.numbers("timestamp")
-    _require(raw, np.isfinite(timestamp), "timestamp", timestamp, "a finite number of seconds")
-    scene = raw.texts("scene", raw.path.stem)
-    _check_order(raw, scene, timestamp)
-    empty = raw.flags("empty") | (~raw.present("x") & ~raw.present("y")) | raw.labels()[1]
-    coordinates = raw.texts("coordinates", raw.how.coordinates or "world")
-    strange = ~np.isin(coordinates, _COORDINATES)
-    if strange.any():
-        row = int(np.argmax(strange))
-        raise raw.fault(row, f"coordinates: expected world, ego, sensor or camera, got {str(coordinates[row])!r}")
-    ego = EgoColumns.from_table(raw)
-    pose = _pose(raw, coordinates, ego is not None)
-    detections = replace(box_columns(raw, empty), position_covariance=_covariances(raw, empty))
-    of_camera = coordinates == "camera"
-    if of_camera.any():
-        detections = replace(detections, boxes=_from_camera(detections.boxes, of_camera))
-    coordinates = np.where(of_camera, "ego", coordinates)
-    return _Rows(
-        raw=raw,
-        scene=scene,
-        timestamp=timestamp,
-        sensor=raw.texts("sensor", "sensor"),
-        coordinates=coordinates,
-        empty=empty,
-        detections=detections,
-        pose=pose,
-        ego=ego,
-    )
-
-
 def _check_order(raw: RawTable, scene: StrArray, timestamp: FloatArray) -> None:
     order = np.argsort(scene, kind="stable")
     late = (np.diff(timestamp[order]) < 0) & (scene[order][1:] == scene[order][:-1])
-    if late.any():
-        row = int(order[1:][np.argmax(late)])
-        title = raw.title("timestamp")
-        text = f"{title}: expected rows in order of time, time runs backwards at {timestamp[row]} s; --sort sorts them"
-        raise raw.fault(row, text)
+    expected = f"{raw.title('timestamp')}: expected rows in order of time, time runs backwards at"
+    refuse(late, lambda k: raw.fault(int(order[k + 1]), f"{expected} {timestamp[order[k + 1]]} s; --sort sorts them"))
 
 
 def box_columns(raw: RawTable, empty: BoolArray) -> Detections:
@@ -210,10 +163,8 @@ def _covariances(raw: RawTable, empty: BoolArray) -> FloatArray:
     xx, xy, yy = (raw.numbers(name) for name in COVARIANCE)
     given = ~empty & ~(np.isnan(xx) & np.isnan(xy) & np.isnan(yy))
     bad = given & ~((xx > 0) & (yy > 0) & (xx * yy > xy**2))
-    if bad.any():
-        row = int(np.argmax(bad))
-        got = f"got {xx[row]:g}, {xy[row]:g}, {yy[row]:g}"
-        raise raw.fault(row, f"{', '.join(COVARIANCE)}: expected a positive definite matrix, {got}")
+    expected = f"{', '.join(COVARIANCE)}: expected a positive definite matrix"
+    refuse(bad, lambda row: raw.fault(row, f"{expected}, got {xx[row]:g}, {xy[row]:g}, {yy[row]:g}"))
     return from_upper_triangle(np.where(given, [xx, xy, yy], np.nan).T)
 
 
@@ -230,9 +181,9 @@ def _pose(raw: RawTable, coordinates: StrArray, estimated: bool) -> FloatArray |
     """(N, 4); None where there are none, as there may where the vehicle's own measurements stand in for them."""
     given = [name for name in POSE if raw.present(name).any()]
     if not given:
-        if (coordinates != "world").any() and not estimated:
-            row = int(np.argmax(coordinates != "world"))
-            raise raw.fault(row, f"coordinates: {coordinates[row]} needs the columns ego_x, ego_y and ego_yaw")
+        needed = "needs the columns ego_x, ego_y and ego_yaw"
+        alone = (coordinates != "world") & (not estimated)
+        refuse(alone, lambda row: raw.fault(row, f"coordinates: {coordinates[row]} {needed}"))
         return None
     columns = {name: raw.numbers(name, 0.0 if name == "ego_z" else np.nan) for name in POSE}
     for name, column in columns.items():

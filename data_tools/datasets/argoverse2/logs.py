@@ -42,7 +42,16 @@ from data_tools.datasets.source import AreaMap, Kind, map_points
 from data_tools.files import WHOLE, arrow_arrays, parsed_json, read_bytes
 from data_tools.trajectories import central_differences
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics import FloatArray, IntArray, StrArray, checked, checked_quaternions, quaternion_rotation, yaw_of
+from saga_fg.numerics import (
+    FloatArray,
+    IntArray,
+    StrArray,
+    checked,
+    checked_quaternions,
+    quaternion_rotation,
+    refuse,
+    yaw_of,
+)
 from saga_fg.tables import DetectionTable
 from saga_fg.types import Annotations, Boxes, Detections, Frame, Scene
 
@@ -85,8 +94,8 @@ class ArgoverseLogs:
     def __init__(self, root: str | Path) -> None:
         self._root = Path(root)
         files = [path for name in FILES for path in self._root.glob(f"*/{name}")]
-        self._scenes = tuple(sorted({path.parent.name for path in files}))
-        if not self._scenes:
+        self.scenes = tuple(sorted({path.parent.name for path in files}))
+        if not self.scenes:
             if not self._root.is_dir():
                 raise InputError(f"{self._root}: expected the folder of the logs, there is no such folder")
             if any((self._root / name).is_file() for name in FILES):
@@ -94,11 +103,6 @@ class ArgoverseLogs:
                     f"{self._root}: expected the folder of the logs, this is one log: give {self._root.parent}"
                 )
             raise InputError(f"{self._root}: expected LOG/annotations.feather, there is none")
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        """The names of the logs."""
-        return self._scenes
 
     def annotated(self, name: str) -> bool:
         """True if a log has annotations."""
@@ -109,8 +113,8 @@ class ArgoverseLogs:
 
         Raises `InputError` for an unknown name, a missing column, or a time without a pose.
         """
-        if name not in self._scenes:
-            raise InputError(f"{self._root}: {unknown_name('log', name, self._scenes)}")
+        if name not in self.scenes:
+            raise InputError(f"{self._root}: {unknown_name('log', name, self.scenes)}")
         path = self._root / name / "annotations.feather"
         rows = arrow_arrays(path, _ANNOTATIONS, KINDS)
         stamp: IntArray = rows["timestamp_ns"]
@@ -138,10 +142,8 @@ class ArgoverseLogs:
         known = rows["timestamp_ns"][order]
         at = np.minimum(np.searchsorted(known, stamps), max(len(known) - 1, 0))
         absent = known[at] != stamps if len(known) else np.ones(len(stamps), dtype=bool)
-        if absent.any():
-            raise InputError(
-                f"{path}: timestamp_ns: expected a pose at every time of boxes, {stamps[absent][0]} has none"
-            )
+        expected = f"{path}: timestamp_ns: expected a pose at every time of boxes"
+        refuse(absent, lambda row: InputError(f"{expected}, {stamps[row]} has none"))
         with error_context(str(path)):
             return transforms(rows)[order][at]
 

@@ -40,6 +40,7 @@ from saga_fg.numerics import (
     FloatArray,
     StrArray,
     from_upper_triangle,
+    refuse,
 )
 from saga_fg.tables import (
     LABEL_COLUMNS,
@@ -261,9 +262,7 @@ def track_rows(raw: RawTable, tell: Callable[[Sequence[Finding], RawTable], None
     kept = np.flatnonzero(~left_out)
     found = box_columns(raw, left_out)
     timestamp = raw.numbers("timestamp")
-    if np.isnan(timestamp).any():
-        row = int(np.argmax(np.isnan(timestamp)))
-        raise raw.fault(row, f"{raw.title('timestamp')}: expected a number, got none")
+    refuse(np.isnan(timestamp), lambda row: raw.fault(row, f"{raw.title('timestamp')}: expected a number, got none"))
     scene = raw.texts("scene", raw.path.stem)[kept]
     if not raw.how.as_given and len(kept):
         first = scene == scene[0]
@@ -375,9 +374,8 @@ def _read_table(path: Path) -> dict[str, PredictionRows]:
         if np.isnan(columns[name]).any():
             raise raw.fault(int(np.argmax(np.isnan(columns[name]))), f"{name}: expected a number, got none")
     odd = (columns["id"] != np.rint(columns["id"])) | (np.abs(columns["id"]) > _LARGEST_ID)
-    if odd.any():
-        row = int(np.argmax(odd))
-        raise raw.fault(row, f"id: expected a whole number within {_LARGEST_ID}, got {columns['id'][row]:g}")
+    expected = f"id: expected a whole number within {_LARGEST_ID}"
+    refuse(odd, lambda row: raw.fault(row, f"{expected}, got {columns['id'][row]:g}"))
     rows = PredictionRows(
         columns["timestamp"],
         columns["horizon"],

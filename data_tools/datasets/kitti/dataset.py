@@ -57,7 +57,7 @@ from data_tools.lidar import KITTI, Scan, ScanRecording, azimuth_times, read_rec
 from data_tools.metrics.kitti_boxes import KittiObjects, camera_boxes_to_world, has_box
 from data_tools.trajectories import central_differences
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics import FloatArray, inverse_transform, is_rotation
+from saga_fg.numerics import FloatArray, inverse_transform, is_rotation, refuse
 from saga_fg.types import Annotations, Detections, Frame, Scene
 
 _KEYS: dict[str, tuple[tuple[int, int], tuple[str, ...]]] = {
@@ -152,10 +152,9 @@ def read_poses(path: str | Path) -> FloatArray:
     if not len(table):
         raise InputError(f"{path}: expected a record per frame, the file is empty")
     latitude, longitude, altitude, roll, pitch, yaw = table.numbers(slice(0, 6), _COLUMNS).T
-    for name, angle, largest in (("latitude", latitude, 85.0), ("longitude", longitude, 180.0)):
-        if (np.abs(angle) > largest).any():
-            row = int(np.argmax(np.abs(angle) > largest))
-            raise table.fault(row, f"{name}: expected degrees within {largest:g} of 0, got {angle[row]:g}")
+    expected = "expected degrees within {} of 0, got {:g}"
+    refuse(np.abs(latitude) > 85, lambda row: table.fault(row, f"latitude: {expected.format(85, latitude[row])}"))
+    refuse(np.abs(longitude) > 180, lambda row: table.fault(row, f"longitude: {expected.format(180, longitude[row])}"))
     poses = np.tile(np.eye(4), (len(table), 1, 1))
     poses[:, :3, :3] = _turn(yaw, 0, 1) @ _turn(pitch, 2, 0) @ _turn(roll, 1, 2)
     poses[:, :3, 3] = world_position(latitude, longitude, altitude, np.array([latitude[0], longitude[0], altitude[0]]))
@@ -171,27 +170,14 @@ def world_position(latitude: FloatArray, longitude: FloatArray, altitude: FloatA
     )
 
 
-@dataclass(frozen=True, eq=False)
-class SensorRecords:
-    """K records in the vehicle's axes, without the poses.
+def read_sensors(path: str | Path) -> dict[str, FloatArray]:
+    """What the K records say by sensor, in the vehicle's axes. Raises `InputError` as `read_poses` does.
 
-    position (K, 3) as in `read_poses`, m; speed (K,) ahead, m/s; acceleration (K, 3) specific force, m/s^2;
-    angular_rate (K, 3), rad/s
+    gps (K, 3): positions as in `read_poses`, m; wheels (K, 1): speed ahead, m/s; imu (K, 6): specific force, m/s^2,
+    and turn rate, rad/s
     """
-
-    position: FloatArray
-    speed: FloatArray
-    acceleration: FloatArray
-    angular_rate: FloatArray
-
-
-def read_sensors(path: str | Path) -> SensorRecords:
-    """Read what the records say of velocity, acceleration and turn rate. Raises `InputError` as `read_poses` does."""
-    position = read_poses(path)[:, :3, 3]
-    table = _records(path)
-    names = ("vf", "ax", "ay", "az", "wx", "wy", "wz")
-    numbers = table.numbers([8, 11, 12, 13, 17, 18, 19], names)
-    return SensorRecords(position, numbers[:, 0], numbers[:, 1:4], numbers[:, 4:])
+    numbers = _records(path).numbers([8, 11, 12, 13, 17, 18, 19], ("vf", "ax", "ay", "az", "wx", "wy", "wz"))
+    return {"imu": numbers[:, 1:], "wheels": numbers[:, :1], "gps": read_poses(path)[:, :3, 3]}
 
 
 def _records(path: str | Path) -> TextTable:
@@ -241,17 +227,12 @@ class KittiTracking:
         present = tuple(sorted(path.stem for path in (self._root / "oxts").glob("*.txt")))
         if not present:
             raise InputError(f"{self._root / 'oxts'}: expected GPS/IMU records NNNN.txt, there are none")
-        self._sequences = present if sequences is None else tuple(dict.fromkeys(sequences))
-        for name in self._sequences:
+        self.scenes: tuple[str, ...] = present if sequences is None else tuple(dict.fromkeys(sequences))
+        for name in self.scenes:
             if name not in present:
                 raise InputError(f"{self._root / 'oxts'}: {unknown_name('sequence', name, present)}")
         if self._detections is not None and not self._detections.is_dir():
             raise InputError(f"{self._detections}: expected a folder with Car/, Pedestrian/, Cyclist/")
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        """The names of the chosen sequences."""
-        return self._sequences
 
     def calibration(self, name: str) -> Calibration:
         """The calibration of a sequence."""
@@ -278,8 +259,8 @@ class KittiTracking:
             return Scene(name, times, poses, tokens, frames, truth)
 
     def _file(self, folder: str, name: str) -> Path:
-        if name not in self._sequences:
-            raise InputError(f"{self._root}: {unknown_name('sequence', name, self._sequences)}")
+        if name not in self.scenes:
+            raise InputError(f"{self._root}: {unknown_name('sequence', name, self.scenes)}")
         return self._root / folder / f"{name}.txt"
 
     def _frames(self, name: str, times: FloatArray, poses: FloatArray, world_T_camera: FloatArray) -> list[Frame]:

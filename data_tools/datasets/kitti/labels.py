@@ -31,12 +31,13 @@ import numpy as np
 from data_tools.files import TextTable, read_table
 from data_tools.metrics.kitti_boxes import CameraBoxes, KittiObjects, has_box
 from saga_fg.errors import InputError, unknown_name
-from saga_fg.numerics import FloatArray, IntArray, StrArray, wrap_angle
+from saga_fg.numerics import FloatArray, IntArray, StrArray, refuse, wrap_angle
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
 
 _IMAGE_COLUMNS = ("truncated", "occluded", "alpha", "x1", "y1", "x2", "y2")
 _BOX_COLUMNS = ("h", "w", "l", "x", "y", "z", "rotation_y", "score")
+_POSITIVE = "h w l: expected a positive size in m"
 
 
 def read_kitti_labels(path: str | Path) -> KittiObjects:
@@ -66,14 +67,14 @@ def lower_case_classes(type_: StrArray) -> StrArray:
 
 
 def _check(table: TextTable, objects: KittiObjects) -> None:
-    strange = ~np.isin(objects.type, TYPES)
-    if strange.any():
-        row = int(np.argmax(strange))
-        raise table.fault(row, f"type: {unknown_name('class', str(objects.type[row]), TYPES)}")
-    flat = has_box(objects) & (objects.boxes.size <= 0).any(axis=1)
-    if flat.any():
-        row = int(np.argmax(flat))
-        raise table.fault(row, f"h w l: expected a positive size in m, got {objects.boxes.size[row].tolist()}")
+    type_, size = objects.type, objects.boxes.size
+    refuse(
+        ~np.isin(type_, TYPES), lambda row: table.fault(row, f"type: {unknown_name('class', str(type_[row]), TYPES)}")
+    )
+    refuse(
+        has_box(objects) & (size <= 0).any(axis=1),
+        lambda row: table.fault(row, f"{_POSITIVE}, got {size[row].tolist()}"),
+    )
     tracked = np.flatnonzero(objects.track_id >= 0)
     pairs = np.stack([objects.frame[tracked], objects.track_id[tracked]], axis=1)
     _, first = np.unique(pairs, axis=0, return_index=True)
@@ -131,14 +132,11 @@ def _read(path: Path, name: str, frames: int) -> tuple[IntArray, FloatArray]:
     table: TextTable = read_table(path, (15,), "frame, type, x1, y1, x2, y2, score, h, w, l, x, y, z, ...", ",")
     frame = table.integers(0, "frame", 0, frames - 1)
     code = table.integers(1, "type", 0)
-    if (code != CLASS_CODES[name]).any():
-        row = int(np.argmax(code != CLASS_CODES[name]))
-        raise table.fault(row, f"type: expected {CLASS_CODES[name]} in a file of class {name}, got {code[row]}")
+    expected = f"type: expected {CLASS_CODES[name]} in a file of class {name}"
+    refuse(code != CLASS_CODES[name], lambda row: table.fault(row, f"{expected}, got {code[row]}"))
     numbers = table.numbers(slice(2, None), _NUMBERS)
-    flat = (numbers[:, 5:8] <= 0).any(axis=1)
-    if flat.any():
-        row = int(np.argmax(flat))
-        raise table.fault(row, f"h w l: expected a positive size in m, got {numbers[row, 5:8].tolist()}")
+    size = numbers[:, 5:8]
+    refuse((size <= 0).any(axis=1), lambda row: table.fault(row, f"{_POSITIVE}, got {size[row].tolist()}"))
     return frame, numbers
 
 

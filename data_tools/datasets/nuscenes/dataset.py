@@ -27,7 +27,6 @@ import numpy as np
 from data_tools.datasets.nuscenes.results import ResultFile, ResultMeta, read_result_file
 from data_tools.datasets.nuscenes.tables import (
     LIDAR,
-    SceneRecord,
     keyframes,
     read_annotations,
     read_scenes,
@@ -70,13 +69,13 @@ class NuScenes:
     ) -> None:
         self.dataroot, self.version = dataroot, version
         self.folder = folder = table_folder(dataroot, version)
-        tables = read_scenes(folder, scenes)
-        self.records: dict[str, SceneRecord] = tables.records
+        self.records, all_samples = read_scenes(folder, scenes)
+        self.scenes = tuple(self.records)
         wanted = {token for record in self.records.values() for token in record.tokens}
         self._paths = {sensor: Path(path) for sensor, path in detections.items()}
         self._results: dict[str, ResultFile] = {}
         for sensor, path in self._paths.items():
-            self._results[sensor] = read_result_file(path, "detection", tables.all_samples, wanted)
+            self._results[sensor] = read_result_file(path, "detection", all_samples, wanted)
             missing = len(wanted - self._results[sensor].rows.keys())
             if missing:
                 log.warning(
@@ -88,11 +87,6 @@ class NuScenes:
         self._annotations: dict[str, list[Annotations]] | None = (
             read_annotations(folder, self.records) if ground_truth else None
         )
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        """The names of the chosen scenes, in the order they were given or, without a choice, of the table."""
-        return tuple(self.records)
 
     @property
     def meta(self) -> ResultMeta:
@@ -138,7 +132,7 @@ def nuscenes_scans(dataroot: Path, folder: Path, scene: str, sweeps: bool = True
     sweeps: those between keyframes as well. Raises `InputError` for broken tables, and for names of files outside the
     dataroot.
     """
-    samples = set(read_scenes(folder, [scene]).records[scene].tokens)
+    samples = set(read_scenes(folder, [scene])[0][scene].tokens)
     fields = ("sample_token", "ego_pose_token", "calibrated_sensor_token", "filename", "timestamp", "is_key_frame")
     rows = {
         float(time) * 1e-6: (file_below(dataroot, folder, sample, name), pose, mount)

@@ -127,9 +127,9 @@ def _sample_boxes(where: str, task: Task, token: str, boxes: Any) -> ResultBoxes
             got = value if len(value) > 1 else value[0]
             raise InputError(f"{where}: box {row}: {name}: expected {expected}, got {got}")
     classes = DETECTION_CLASSES if task == "detection" else TRACKING_CLASSES
-    strange = next((row for row, name in enumerate(labels) if name not in classes), None)
-    if strange is not None:
-        raise InputError(f"{where}: box {strange}: {label}: {unknown_name('class', labels[strange], classes)}")
+    for row, name in enumerate(labels):
+        if name not in classes:
+            raise InputError(f"{where}: box {row}: {label}: {unknown_name('class', name, classes)}")
     read = Boxes(
         label=np.array(labels, dtype=np.str_),
         position=numbers["translation"],

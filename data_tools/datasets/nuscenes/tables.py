@@ -204,16 +204,11 @@ class SceneRecord:
     world_T_ego: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class SceneTables:
-    """The chosen scenes by name, and the tokens of all samples of all scenes."""
+def read_scenes(folder: Path, names: Collection[str] | None) -> tuple[dict[str, SceneRecord], Collection[str]]:
+    """The chosen scenes (None: all) by name, and the tokens of all samples of all scenes.
 
-    records: dict[str, SceneRecord]
-    all_samples: frozenset[str]
-
-
-def read_scenes(folder: Path, names: Collection[str] | None) -> SceneTables:
-    """Read the chosen scenes (None: all). Raises `InputError` for unknown names and broken records."""
+    Raises `InputError` for unknown names and broken records.
+    """
     scenes = {name: (first, count) for name, first, count in _scene_rows(folder)}
     chosen = tuple(scenes) if names is None else tuple(dict.fromkeys(names))
     for name in chosen:
@@ -231,7 +226,7 @@ def read_scenes(folder: Path, names: Collection[str] | None) -> SceneTables:
         name: SceneRecord(name, chain, times[name], np.array([poses[token] for token in chain]).reshape(-1, 4, 4))
         for name, chain in chains.items()
     }
-    return SceneTables(records, frozenset(samples))
+    return records, samples.keys()
 
 
 def _scene_rows(folder: Path) -> list[tuple[Any, ...]]:
