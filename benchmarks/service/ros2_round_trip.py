@@ -17,10 +17,9 @@ import numpy as np
 
 from benchmarks.runner import PROGRAM, each
 from benchmarks.service.served import CirclingObjects
-from data_tools.datasets.mcap.objects import AUTOWARE_CLASSES, pose, vector
+from data_tools.datasets.mcap.objects import AUTOWARE_CLASSES, poses, vectors
 from data_tools.datasets.mcap.recording import LoggedMessage
-from data_tools.datasets.mcap.ros2_types import Columns, encoded, header
-from pipelines.serving.ros2 import payload_decoder
+from data_tools.datasets.mcap.ros2_types import decoder, encoded, header, ros_message
 from pipelines.serving.ros2_dds import DdsNetwork
 from saga_fg.errors import SagaError
 
@@ -36,31 +35,28 @@ LOOPBACK = (
 )
 
 
-def detected_objects(stamp: int, frame: str, position: np.ndarray[Any, Any]) -> dict[str, Any]:
+def detected_objects(stamp: int, frame: str, position: np.ndarray[Any, Any]) -> Any:
     """Return a `DetectedObjects` of cars at positions (N, 3), m, of unknown heading and velocity; stamp: ns."""
-    nothing = vector(np.zeros(3))
-    twist = {"twist": {"linear": nothing, "angular": nothing}, "covariance": np.zeros(36)}
-    known = {"has_position_covariance": False, "has_twist": False, "has_twist_covariance": False}
-    place = {"pose": pose(position, np.zeros(len(position))), "covariance": np.zeros(36)}
-    objects = {
-        "existence_probability": 0.9,
-        "classification": [{"label": AUTOWARE_CLASSES.index("car"), "probability": 1.0}],
-        "kinematics": {
-            "pose_with_covariance": place,
-            "twist_with_covariance": twist,
-            "orientation_availability": 0,
-            **known,
-        },
-        "shape": {"type": 0, "footprint": {"points": []}, "dimensions": vector(np.array([4.5, 1.9, 1.6]))},
-    }
-    return {"header": header(stamp, frame), "objects": Columns(len(position), objects)}
+    nothing, size = vectors(np.array([[0.0, 0.0, 0.0], [4.5, 1.9, 1.6]]))
+    twist = ros_message("geometry_msgs/Twist", nothing, nothing)
+    motion = ros_message("geometry_msgs/TwistWithCovariance", twist, np.zeros(36))
+    car = [ros_message("autoware_perception_msgs/ObjectClassification", AUTOWARE_CLASSES.index("car"), 1.0)]
+    shape = ros_message("autoware_perception_msgs/Shape", 0, ros_message("geometry_msgs/Polygon", []), size)
+    objects = []
+    for pose in poses(position, np.zeros(len(position))):
+        place = ros_message("geometry_msgs/PoseWithCovariance", pose, np.zeros(36))
+        known = place, False, 0, motion, False, False
+        kinematics = ros_message("autoware_perception_msgs/DetectedObjectKinematics", *known)
+        objects.append(ros_message("autoware_perception_msgs/DetectedObject", 0.9, car, kinematics, shape))
+    return ros_message(DETECTED, header(stamp, frame), objects)
 
 
-def vehicle_transform(stamp: int, position: np.ndarray[Any, Any]) -> dict[str, Any]:
+def vehicle_transform(stamp: int, position: np.ndarray[Any, Any]) -> Any:
     """Return a `TFMessage` of a vehicle that looks along x."""
-    place = pose(position, 0.0)
-    transform = {"translation": place["position"], "rotation": place["orientation"]}
-    return {"transforms": [{"header": header(stamp, "map"), "child_frame_id": "base_link", "transform": transform}]}
+    (pose,), (at,) = poses(position[None], np.zeros(1)), vectors(position[None])
+    transform = ros_message("geometry_msgs/Transform", at, pose.orientation)
+    stamped = ros_message("geometry_msgs/TransformStamped", header(stamp, "map"), "base_link", transform)
+    return ros_message("tf2_msgs/TFMessage", [stamped])
 
 
 class Peer:
@@ -105,7 +101,7 @@ class Peer:
     @property
     def tracks(self) -> int:
         """How many tracks the last message has."""
-        return len(payload_decoder(TRACKED)(self.last).objects)
+        return len(decoder(TRACKED)(self.last).objects)
 
     def wait(self, process: subprocess.Popen[Any], seconds: float, stamp: int | None = None) -> None:
         """Publish, at one time, ns, or now, until tracks come. Raises `SagaError` where none do."""

@@ -26,7 +26,7 @@ import numpy as np
 from data_tools.datasets.mcap.dataset import RecordingOptions, message_content, placed_frames
 from data_tools.datasets.mcap.objects import OBJECT_TYPES, RESULTS, MessageObjects, message_objects
 from data_tools.datasets.mcap.recording import LoggedMessage
-from data_tools.datasets.mcap.ros2_types import definition, encoded, plain_type
+from data_tools.datasets.mcap.ros2_types import decoder, encoded, plain_type
 from data_tools.datasets.mcap.transforms import HOLD, ODOMETRY_TYPES, WORLD, TransformBuffer, find_places
 from data_tools.files import one_line
 from pipelines.serving.messages import FrameMessage
@@ -37,12 +37,11 @@ from saga_fg.errors import InputError, error_context
 from saga_fg.types import Frame, Tracks
 
 try:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    import rosbags  # noqa: F401
 except ImportError as error:
     from saga_fg.errors import MissingExtraError
 
     raise MissingExtraError("messages of ROS 2 need rosbags: pip install 'saga-fg[ros2]'") from error
-
 
 log = logging.getLogger(__name__)
 
@@ -63,13 +62,6 @@ def open_network(wanted: Mapping[str, Collection[str]], middleware: Middleware |
     from pipelines.serving.ros2_dds import DdsNetwork
 
     return DdsNetwork(wanted)
-
-
-def payload_decoder(type_: str) -> Callable[[bytes], Any]:
-    """Return the function that decodes payloads of a type that is known here; it raises what it will for others."""
-    store, name = get_typestore(Stores.EMPTY), plain_type(type_).replace("/", "/msg/")
-    store.register(get_types_from_msg(definition(type_) or "", name))
-    return partial(store.deserialize_cdr, typename=name)
 
 
 PATIENCE = 0.5  # s
@@ -134,7 +126,7 @@ class Ros2Node:
         self._network = open_network(inputs, middleware)
         self._transforms = TransformBuffer()
         self._numbers: Counter[str] = Counter()
-        self._decode = {type_: payload_decoder(type_) for types in inputs.values() for type_ in types}
+        self._decode = {type_: decoder(type_) for types in inputs.values() for type_ in types}
         self._publishers: dict[str, tuple[str, Callable[[bytes], None]]] = {}
         self._waiting: list[tuple[LoggedMessage, MessageObjects, float]] = []  # with when they came
         self._open_results()

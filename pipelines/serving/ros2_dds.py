@@ -14,7 +14,7 @@ from functools import cache, partial
 from typing import Any
 
 from data_tools.datasets.mcap.recording import LoggedMessage
-from data_tools.datasets.mcap.ros2_types import NUMBERS, fields_of, plain_type
+from data_tools.datasets.mcap.ros2_types import fields_of, plain_type
 from pipelines.serving.ros2_network import DEPTH, PUBLISHED_DEPTH, TRANSIENT, Ros2Network
 from saga_fg.errors import InputError
 
@@ -34,7 +34,8 @@ except ImportError as error:
 BLOCKING = 100_000_000  # ns that a full reliable writer waits
 AT_ONCE = 1000  # publishers
 _TYPES: Any = types
-PLAIN = {"string": str, "bool": bool} | {name: getattr(_TYPES, name) for name in NUMBERS if name != "bool"}
+NUMBERS = ("uint8", "int8", "uint16", "int32", "uint32", "float32", "float64")
+PLAIN = {"string": str, "bool": bool} | {name: getattr(_TYPES, name) for name in NUMBERS}
 _DOMAINS = 233
 
 

@@ -246,9 +246,12 @@ class RawTable:
                 unit = self.how.unit(of, self.found.units.get(of))
                 numbers = numbers if unit is None else in_our_unit(of, numbers, unit, power)
         large = np.abs(numbers) > LIMITS.get(name, sys.float_info.max)
-        within = f" within {LIMITS[name]:g}" if name in LIMITS else ""
-        expected = f"{self.title(name)}: expected a finite number{within}"
-        refuse(large, lambda row: self.fault(row, f"{expected}, got {numbers[row]:g}"))
+
+        def fault(row: int) -> InputError:
+            within = f" within {LIMITS[name]:g}" if np.isfinite(numbers[row]) else ""
+            return self.fault(row, f"{self.title(name)}: expected a finite number{within}, got {numbers[row]:g}")
+
+        refuse(large, fault)
         return numbers
 
     def plain_numbers(self, name: str) -> FloatArray:

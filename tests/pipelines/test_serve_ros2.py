@@ -20,9 +20,10 @@ from benchmarks.service.ros2_round_trip import INTERVAL, LOOPBACK, TRACKED, Peer
 from data_tools.datasets.mcap.dataset import RecordingOptions
 from data_tools.datasets.mcap.objects import autoware_rows, message_objects
 from data_tools.datasets.mcap.recording import LoggedMessage, Topic
+from data_tools.datasets.mcap.ros2_types import decoder
 from pipelines.config import load_config
 from pipelines.serving import StreamSettings, StreamTracker
-from pipelines.serving.ros2 import Ros2Node, open_network, payload_decoder, result_topics, shown_tracks
+from pipelines.serving.ros2 import Ros2Node, open_network, result_topics, shown_tracks
 from pipelines.serving.ros2_dds import DdsNetwork, structure
 from saga_fg import InputError
 from saga_fg.errors import MissingExtraError
@@ -67,7 +68,7 @@ def test_every_frame_at_true_rate_has_its_tracks_and_a_killed_node_goes_on(tmp_p
             peer.read(begin + k * INTERVAL)
             peer.publish(stamp)
         wait_for(lambda: peer.read(time.monotonic() + INTERVAL) is not None and peer.came.keys() >= set(stamps))
-        before = {row.id for row in autoware_rows(payload_decoder(TRACKED)(peer.last)).objects}
+        before = {row.id for row in autoware_rows(decoder(TRACKED)(peer.last)).objects}
         assert len(before) == 20
         time.sleep(0.5)  # written by now
         assert node.end(signal.SIGKILL) == -signal.SIGKILL
@@ -75,7 +76,7 @@ def test_every_frame_at_true_rate_has_its_tracks_and_a_killed_node_goes_on(tmp_p
         assert "going on from" in node.log.read_text()
         peer.came.clear()
         peer.wait(node.process, 60, stamps[-1] + round(INTERVAL * 1e9))
-        after = {row.id for row in autoware_rows(payload_decoder(TRACKED)(peer.last)).objects}
+        after = {row.id for row in autoware_rows(decoder(TRACKED)(peer.last)).objects}
         assert before == after
     finally:
         assert node.end() == 143
@@ -106,7 +107,7 @@ def test_types_and_qualities_of_publishers_are_found_and_other_types_are_named(t
 
     wait_for(heard)
     assert [(topic, each.type) for topic, each in network.subscribed.items()] == [("/odom", odometry)]
-    message = payload_decoder(odometry)(found[0].message)
+    message = decoder(odometry)(found[0].message)
     assert message.child_frame_id == "base_link"
     assert message.pose.pose.position.y == content["pose"]["pose"]["position"]["y"]
     assert set(caplog.messages) == {
@@ -129,7 +130,7 @@ class Published:
         self.sent = []
 
         def publisher(network, topic, type_):
-            return lambda data: self.sent.append((topic, type_, payload_decoder(type_)(data)))
+            return lambda data: self.sent.append((topic, type_, decoder(type_)(data)))
 
         monkeypatch.setattr(DdsNetwork, "publisher", publisher)
         config = load_config("file")
@@ -379,7 +380,7 @@ def test_the_node_runs_by_rclpy_where_that_is_installed(monkeypatch):
     }
     assert {(topic, kind) for topic, kind, _ in ros.published} == {("/tracks", TRACKED.replace("/", ".msg."))}
     assert len(ros.published) == 10
-    tracked = message_objects(autoware_rows(payload_decoder(TRACKED)(ros.published[-1][2])), {})
+    tracked = message_objects(autoware_rows(decoder(TRACKED)(ros.published[-1][2])), {})
     expected = {label: place for label, place, *_ in example.objects(9)}
     for label, place in zip(tracked.detections.boxes.label, tracked.detections.boxes.position, strict=True):
         np.testing.assert_allclose(place, expected[label], atol=0.3)

@@ -151,7 +151,7 @@ def test_wrong_options(tmp_path, drive):
 def test_without_the_extra_it_is_named(tmp_path, drive, monkeypatch):
     import sys
 
-    monkeypatch.setitem(sys.modules, "mcap_ros2", None)
+    monkeypatch.setitem(sys.modules, "rosbags", None)
     code, output = saga_fg("track", "mcap", drive, "--output", tmp_path / "tracks.mcap")
     assert code != 0
     assert "pip install 'saga-fg[mcap]'" in " ".join(output.split())

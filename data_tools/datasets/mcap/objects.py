@@ -17,16 +17,15 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from data_tools.datasets.mcap.ros2_types import Columns, Message, frame_name, header, nanoseconds, wxyz, xyz
+from data_tools.datasets.mcap.ros2_types import frame_name, header, nanoseconds, ros_message, wxyz, xyz
 from saga_fg.errors import InputError
 from saga_fg.numerics import (
     FloatArray,
-    IntArray,
     StrArray,
     quaternion_norms,
     quaternion_rotation,
+    refuse,
     yaw_of,
     yaw_quaternion,
 )
@@ -72,6 +71,10 @@ class ObjectRows:
     in_body: bool = False
     objects: list[ObjectRow] = field(default_factory=list)
 
+    def fault(self, name: str, row: int, what: str) -> InputError:
+        """An error about a field of an object."""
+        return InputError(f"{self.fields[name].format(row)}: {what}")
+
 
 class ObjectType(NamedTuple):
     """A type of message with objects.
@@ -104,17 +107,18 @@ def message_objects(rows: ObjectRows, classes: Mapping[str, str]) -> MessageObje
     """
     position = _numbers(rows, "position", 3, MAX_POSITION)
     size = _numbers(rows, "size", 3, MAX_SIZE, unknown=True)
-    if (size < 0).any():
-        row = int(np.argmax((size < 0).any(axis=1)))
-        raise InputError(f"{rows.fields['size'].format(row)}: expected sizes >= 0 in m, got {rows.objects[row].size}")
+    refuse(
+        (size < 0).any(axis=1),
+        lambda row: rows.fault("size", row, f"expected sizes >= 0 in m, got {rows.objects[row].size}"),
+    )
     score = _numbers(rows, "score", 0, np.inf)
     rotation = _numbers(rows, "rotation", 4, np.inf)
     norm = quaternion_norms(rotation)
     turned = norm > 0
-    bad = turned & (np.abs(norm - 1) > 1e-2)
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise InputError(f"{rows.fields['rotation'].format(row)}: expected a unit quaternion, got norm {norm[row]:.4g}")
+    refuse(
+        turned & (np.abs(norm - 1) > 1e-2),
+        lambda row: rows.fault("rotation", row, f"expected a unit quaternion, got norm {norm[row]:.4g}"),
+    )
     unit = np.where(turned[:, None], rotation, [1.0, 0, 0, 0]) / np.where(turned, norm, 1.0)[:, None]
     R = quaternion_rotation(unit)
     velocity = _numbers(rows, "velocity", 3, MAX_SPEED, unknown=True)
@@ -139,9 +143,10 @@ def _numbers(rows: ObjectRows, name: str, width: int, limit: float, unknown: boo
     bad = ~(np.abs(array) <= limit) if np.isfinite(limit) else ~np.isfinite(array)
     if unknown:
         bad &= ~np.isnan(array)
-    if bad.any():
-        row = int(np.argwhere(bad)[0][0])
-        raise InputError(f"{rows.fields[name].format(row)}: expected finite numbers, got {values[row]}")
+    refuse(
+        bad.reshape(len(values), max(width, 1)).any(axis=1),
+        lambda row: rows.fault(name, row, f"expected finite numbers, got {values[row]}"),
+    )
     return array
 
 
@@ -155,38 +160,40 @@ def _covariances(rows: ObjectRows, name: str) -> FloatArray:
     valid = (
         (P[:, 0, 0] > 0) & (P[:, 1, 1] > 0) & (P[:, 0, 0] * P[:, 1, 1] > P[:, 0, 1] ** 2) & np.isfinite(P).all((1, 2))
     )
-    if (given & ~valid).any():
-        row = int(np.argmax(given & ~valid))
-        got = [[float(f"{entry:.4g}") for entry in line] for line in P[row].tolist()]
-        raise InputError(
-            f"{rows.fields[name].format(row)}: expected a positive definite covariance of x and y, got {got}"
-        )
+    expected = "expected a positive definite covariance of x and y"
+    refuse(
+        given & ~valid,
+        lambda row: rows.fault(name, row, f"{expected}, got {P[row].round(6).tolist()}"),
+    )
     return P
 
 
-def vector(values: FloatArray) -> Message:
-    """Vectors or points (..., 3); unknown entries are 0."""
-    x, y, z = np.moveaxis(np.nan_to_num(values), -1, 0)
-    return {"x": x, "y": y, "z": z}
+def vectors(values: FloatArray, kind: str = "Vector3") -> list[Any]:
+    """geometry_msgs/Vector3s, or Points, of rows (N, 3); unknown entries are 0."""
+    return [ros_message(f"geometry_msgs/{kind}", *row) for row in np.nan_to_num(values).tolist()]
 
 
-def pose(position: FloatArray, yaw: FloatArray | float) -> Message:
-    """geometry_msgs/Poses of positions (..., 3) and headings (...); an unknown one is 0."""
-    w, x, y, z = np.moveaxis(yaw_quaternion(np.nan_to_num(yaw)), -1, 0)
-    return {"position": vector(position), "orientation": {"x": x, "y": y, "z": z, "w": w}}
+def poses(position: FloatArray, yaw: FloatArray) -> list[Any]:
+    """geometry_msgs/Poses of positions (N, 3) and headings (N,); an unknown one is 0."""
+    turns = np.roll(yaw_quaternion(np.nan_to_num(yaw)), -1, axis=1).tolist()  # x y z w
+    return [
+        ros_message("geometry_msgs/Pose", point, ros_message("geometry_msgs/Quaternion", *turn))
+        for point, turn in zip(vectors(position, "Point"), turns, strict=True)
+    ]
 
 
-def covariance(P: FloatArray) -> FloatArray:
-    """The entries (N, 6, 6) of covariances with a horizontal part (N, 2, 2) alone; unknown is 0."""
+def covariances(P: FloatArray) -> FloatArray:
+    """The entries (N, 36) of covariances with a horizontal part (N, 2, 2) alone; unknown is 0."""
     whole = np.zeros((len(P), 6, 6))
     whole[:, :2, :2] = np.nan_to_num(P)
-    return whole
+    return whole.reshape(-1, 36)
 
 
 AUTOWARE_CLASSES = (
     *("unknown", "car", "truck", "bus", "trailer", "motorcycle", "bicycle", "pedestrian", "animal", "hazard"),
     *("over_drivable", "under_drivable"),
 )  # by the number of ObjectClassification
+_PACKAGE = "autoware_perception_msgs"
 _UNAVAILABLE, _AVAILABLE = 0, 2  # orientation
 _CYLINDER, _POLYGON = 1, 2  # shape
 _POSE, _TWIST = "objects[{}].kinematics.pose_with_covariance.", "objects[{}].kinematics.twist_with_covariance."
@@ -229,44 +236,54 @@ def autoware_rows(message: Any) -> ObjectRows:
     return found
 
 
-def autoware_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, str]) -> Message:
+def autoware_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, str]) -> Any:
     """`TrackedObjects` of tracks; a class that Autoware does not have is unknown."""
     boxes, yaw = tracks.boxes, np.nan_to_num(tracks.boxes.yaw)
     c, s = np.cos(yaw), np.sin(yaw)
     frame_T_body = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
     flat = np.einsum("nji,nj->ni", frame_T_body, boxes.velocity)
-    velocity = np.column_stack([flat, np.zeros(len(flat))])
     spread = np.swapaxes(frame_T_body, 1, 2) @ tracks.velocity_covariance @ frame_T_body
-    nothing = vector(np.zeros(3))
-    labels = [_class_number(names.get(label, label)) for label in boxes.label.tolist()]
-    objects = {
-        "object_id": {"uuid": np.pad(_bytes_of(tracks.id), ((0, 0), (8, 0)))},
-        "existence_probability": np.clip(tracks.score, 0, 1),
-        "classification": [{"label": labels, "probability": 1.0}],
-        "kinematics": {
-            "pose_with_covariance": {
-                "pose": pose(boxes.position, boxes.yaw),
-                "covariance": covariance(tracks.position_covariance),
-            },
-            "twist_with_covariance": {
-                "twist": {"linear": vector(velocity), "angular": nothing},
-                "covariance": covariance(spread),
-            },
-            "acceleration_with_covariance": {
-                "accel": {"linear": nothing, "angular": nothing},
-                "covariance": np.zeros(36),
-            },
-            "orientation_availability": np.where(np.isfinite(boxes.yaw), _AVAILABLE, _UNAVAILABLE),
-            "is_stationary": False,
-        },
-        "shape": {"type": 0, "footprint": {"points": []}, "dimensions": vector(boxes.size)},
-    }
-    return {"header": header(stamp, frame), "objects": Columns(len(labels), objects)}
+    motions = zip(
+        poses(boxes.position, boxes.yaw),
+        covariances(tracks.position_covariance),
+        vectors(np.column_stack([flat, np.zeros(len(flat))])),
+        covariances(spread),
+        np.where(np.isfinite(boxes.yaw), _AVAILABLE, _UNAVAILABLE).tolist(),
+        strict=True,
+    )
+    objects = [
+        ros_message(
+            f"{_PACKAGE}/TrackedObject",
+            ros_message("unique_identifier_msgs/UUID", np.frombuffer(id_.to_bytes(16), dtype=np.uint8)),
+            score,
+            [ros_message(f"{_PACKAGE}/ObjectClassification", _class_number(names.get(label, label)), 1.0)],
+            _autoware_motion(*motion),
+            ros_message(f"{_PACKAGE}/Shape", 0, ros_message("geometry_msgs/Polygon", []), size),
+        )
+        for id_, score, label, motion, size in zip(
+            tracks.id.tolist(),
+            np.clip(tracks.score, 0, 1).tolist(),
+            boxes.label.tolist(),
+            motions,
+            vectors(boxes.size),
+            strict=True,
+        )
+    ]
+    return ros_message(f"{_PACKAGE}/TrackedObjects", header(stamp, frame), objects)
 
 
-def _bytes_of(ids: IntArray) -> NDArray[np.uint8]:
-    """The eight bytes (N, 8) of each number, the first one the highest."""
-    return ids.astype(">i8").view(np.uint8).reshape(-1, 8)
+def _autoware_motion(pose: Any, covariance: FloatArray, velocity: Any, spread: FloatArray, orientation: int) -> Any:
+    """`TrackedObjectKinematics` without turn rate and acceleration."""
+    still, nothing = ros_message("geometry_msgs/Vector3", 0.0, 0.0, 0.0), np.zeros(36)
+    twist, rest = ros_message("geometry_msgs/Twist", velocity, still), ros_message("geometry_msgs/Accel", still, still)
+    return ros_message(
+        f"{_PACKAGE}/TrackedObjectKinematics",
+        ros_message("geometry_msgs/PoseWithCovariance", pose, covariance),
+        ros_message("geometry_msgs/TwistWithCovariance", twist, spread),
+        ros_message("geometry_msgs/AccelWithCovariance", rest, nothing),
+        orientation,
+        False,
+    )
 
 
 def _autoware_size(shape: Any) -> tuple[float, float, float]:
@@ -307,65 +324,66 @@ def _vision_rows(message: Any) -> ObjectRows:
     return found
 
 
-def _vision_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, str]) -> Message:
+def _vision_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, str]) -> Any:
     boxes, head = tracks.boxes, header(stamp, frame)
-    place = pose(boxes.position, boxes.yaw)
-    hypothesis = {
-        "hypothesis": {"class_id": [names.get(label, label) for label in boxes.label.tolist()], "score": tracks.score},
-        "pose": {"pose": place, "covariance": covariance(tracks.position_covariance)},
-    }
-    detections = {
-        "header": head,
-        "results": [hypothesis],
-        "bbox": {"center": place, "size": vector(boxes.size)},
-        "id": [str(id_) for id_ in tracks.id.tolist()],
-    }
-    return {"header": head, "detections": Columns(len(boxes), detections)}
+    columns = zip(
+        tracks.id.tolist(),
+        boxes.label.tolist(),
+        tracks.score.tolist(),
+        poses(boxes.position, boxes.yaw),
+        covariances(tracks.position_covariance),
+        vectors(boxes.size),
+        strict=True,
+    )
+    detections = []
+    for id_, label, score, pose, spread, size in columns:
+        hypothesis = ros_message("vision_msgs/ObjectHypothesis", names.get(label, label), score)
+        place = ros_message("geometry_msgs/PoseWithCovariance", pose, spread)
+        results = [ros_message("vision_msgs/ObjectHypothesisWithPose", hypothesis, place)]
+        box = ros_message("vision_msgs/BoundingBox3D", pose, size)
+        detections.append(ros_message("vision_msgs/Detection3D", head, results, box, str(id_)))
+    return ros_message("vision_msgs/Detection3DArray", head, detections)
 
 
-_COLOUR = {"r": 0.1, "g": 0.45, "b": 0.9, "a": 0.5}
+_COLOUR = (0.1, 0.45, 0.9)
 _TEXT_GAP = 0.4  # m above the box
 _UNKNOWN_SIZE = 0.5  # m
 _CUBE, _TEXT, _DELETE_ALL, _MARKERS = 1, 9, 3, "saga_fg"  # types and action of markers, their namespace
 
 
-def _marker_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, str]) -> Message:
+def _marker_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, str]) -> Any:
     """A box and a text for each track; the first marker removes those before."""
-    boxes, n = tracks.boxes, len(tracks)
+    boxes, n, head = tracks.boxes, len(tracks), header(stamp, frame)
     size = np.where(np.isfinite(boxes.size), boxes.size, _UNKNOWN_SIZE)
     above = boxes.position + size * [0, 0, 0.5] + [0, 0, _TEXT_GAP]
     place = np.concatenate([np.zeros((1, 3)), boxes.position, above])
     texts = [f"{names.get(label, label)} {id_}" for label, id_ in zip(boxes.label, tracks.id.tolist(), strict=True)]
-    nothing: Message = {"header": header(0, ""), "format": "", "data": []}
-    markers = {
-        "header": header(stamp, frame),
-        "ns": [_MARKERS] + n * [_MARKERS] + n * [f"{_MARKERS} names"],
-        "id": np.arange(1 + 2 * n),
-        "type": np.repeat([_CUBE, _CUBE, _TEXT], [1, n, n]),
-        "action": np.repeat([_DELETE_ALL, 0], [1, 2 * n]),
-        "pose": pose(place, np.concatenate([[0.0], boxes.yaw, np.zeros(n)])),
-        "scale": vector(np.concatenate([np.zeros((1, 3)), size, np.full((n, 3), 1.0)])),
-        "color": {**_COLOUR, "a": np.repeat([0.0, 0.5, 1.0], [1, n, n])},
-        "lifetime": {"sec": 1, "nanosec": 0},
-        "text": ["", *n * [""], *texts],
-        "frame_locked": False,
-        "points": [],
-        "colors": [],
-        "texture_resource": "",
-        "texture": nothing,
-        "uv_coordinates": [],
-        "mesh_resource": "",
-        "mesh_file": {"filename": "", "data": []},
-        "mesh_use_embedded_materials": False,
-    }
-    return {"markers": Columns(1 + 2 * n, markers)}
+    columns = zip(
+        [_MARKERS] + n * [_MARKERS] + n * [f"{_MARKERS} names"],
+        range(1 + 2 * n),
+        [_CUBE] + n * [_CUBE] + n * [_TEXT],
+        [_DELETE_ALL] + 2 * n * [0],
+        poses(place, np.concatenate([[0.0], boxes.yaw, np.zeros(n)])),
+        vectors(np.concatenate([np.zeros((1, 3)), size, np.ones((n, 3))])),
+        [0.0] + n * [0.5] + n * [1.0],
+        ["", *n * [""], *texts],
+        strict=True,
+    )
+    lifetime, nothing = ros_message("builtin_interfaces/Duration", 1, 0), np.zeros(0, dtype=np.uint8)
+    texture = ros_message("sensor_msgs/CompressedImage", header(0, ""), "", nothing)
+    mesh = ros_message("visualization_msgs/MeshFile", "", nothing)
+    markers = []
+    for *about, opacity, text in columns:
+        look = ros_message("std_msgs/ColorRGBA", *_COLOUR, opacity), lifetime, False, [], [], "", texture, []
+        markers.append(ros_message("visualization_msgs/Marker", head, *about, *look, text, "", mesh, False))
+    return ros_message("visualization_msgs/MarkerArray", markers)
 
 
-_AUTOWARE = ObjectType("autoware_perception_msgs/TrackedObjects", autoware_rows, autoware_message)
+_AUTOWARE = ObjectType(f"{_PACKAGE}/TrackedObjects", autoware_rows, autoware_message)
 _VISION = ObjectType("vision_msgs/Detection3DArray", _vision_rows, _vision_message)
 OBJECT_TYPES = {
-    "autoware_perception_msgs/DetectedObjects": _AUTOWARE,
-    "autoware_perception_msgs/TrackedObjects": _AUTOWARE,
+    f"{_PACKAGE}/DetectedObjects": _AUTOWARE,
+    f"{_PACKAGE}/TrackedObjects": _AUTOWARE,
     "vision_msgs/Detection3DArray": _VISION,
 }
 RESULTS = {

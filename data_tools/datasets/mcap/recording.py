@@ -15,7 +15,7 @@ from io import SEEK_END
 from pathlib import Path
 from typing import Any
 
-from data_tools.datasets.mcap.ros2_types import definition, plain_type
+from data_tools.datasets.mcap.ros2_types import decoder, definition, plain_type
 from data_tools.files import isolated, one_line, open_bytes
 from saga_fg.errors import InputError, MissingExtraError, unknown_name
 
@@ -52,8 +52,8 @@ class Recording:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        if find_spec("mcap_ros2") is None:
-            raise MissingExtraError("recordings of ROS 2 need mcap: pip install 'saga-fg[mcap]'")
+        if find_spec("mcap") is None or find_spec("rosbags") is None:
+            raise MissingExtraError("recordings of ROS 2 need mcap and rosbags: pip install 'saga-fg[mcap]'")
         self.files = _files(self.path)
         self.topics: dict[str, Topic] = {}
         for file in self.files:
@@ -132,7 +132,11 @@ class _McapFile:
             begin = since or None
             for schema, channel, message in reader.iter_messages(list(topics), begin, log_time_order=False):
                 if channel.id not in decoders:
-                    decoders[channel.id] = _decoder(f"{self.path}: {channel.topic}", schema, channel.message_encoding)
+                    where, encoding = f"{self.path}: {channel.topic}", channel.message_encoding
+                    if schema is None:
+                        raise InputError(f"{where}: expected messages encoded as cdr (ROS 2), got {encoding!r}")
+                    text = schema.data.decode() if schema.encoding == "ros2msg" else None
+                    decoders[channel.id] = _decoder(where, schema.name, encoding, text)
                 yield channel.topic, message.log_time, decoders[channel.id], message.data
 
 
@@ -151,8 +155,6 @@ class _SqliteFile:
             ]
 
     def messages(self, topics: Collection[str], since: int) -> Iterator[tuple[str, int, Decode, bytes]]:
-        from mcap.records import Schema
-
         decoders: dict[str, Decode] = {}
         marks = ",".join("?" * len(topics))
         query = f"""SELECT topics.name, topics.type, topics.serialization_format, messages.timestamp, messages.data
@@ -163,9 +165,7 @@ class _SqliteFile:
             definitions = self._definitions(database) if "message_definitions" in tables else {}
             for topic, type_, encoding, time, data in database.execute(query, (*topics, since, since)):
                 if topic not in decoders:
-                    text = definitions.get(type_, "")
-                    schema = Schema(id=1, name=type_, encoding="ros2msg" if text else "", data=text.encode())
-                    decoders[topic] = _decoder(f"{self.path}: {topic}", schema, encoding)
+                    decoders[topic] = _decoder(f"{self.path}: {topic}", type_, encoding, definitions.get(type_))
                 if not isinstance(time, int):
                     raise InputError(f"{self.path}: {topic}: timestamp: expected whole nanoseconds, got {time!r:.40}")
                 yield topic, time, decoders[topic], bytes(data)
@@ -236,23 +236,17 @@ def _split_number(path: Path) -> tuple[str, int, str]:
     return (stem, int(number), "") if number.isdecimal() else ("", 0, path.stem)
 
 
-def _decoder(where: str, schema: Any, encoding: str) -> Decode:
-    """The function that decodes messages of a schema. Raises `InputError` that begins with `where` for none."""
-    from mcap.records import Schema
-    from mcap_ros2.decoder import DecoderFactory
+def _decoder(where: str, type_: str, encoding: str, text: str | None) -> Decode:
+    """The function that decodes messages of a type by its definition, that which is known here for None.
 
-    if schema is None or encoding != "cdr":
+    Raises `InputError` that begins with `where` for none.
+    """
+    if encoding != "cdr":
         raise InputError(f"{where}: expected messages encoded as cdr (ROS 2), got {encoding!r}")
-    if schema.encoding != "ros2msg":
-        text = definition(schema.name)
-        if text is None:
-            raise InputError(
-                f"{where}: expected the definition of {schema.name} in the recording, it has none as ros2msg"
-            )
-        schema = Schema(id=schema.id or 1, name=schema.name, encoding="ros2msg", data=text.encode())
+    if text is None and definition(type_) is None:
+        raise InputError(f"{where}: expected the definition of {type_} in the recording, it has none as ros2msg")
     with one_line("not readable", where):
-        decode: Any = DecoderFactory().decoder_for(encoding, schema)
-    return decode  # type: ignore[no-any-return]
+        return decoder(type_, text)
 
 
 def _cut_off(path: Path) -> bool:

@@ -318,4 +318,4 @@ def test_definitions_hold_all_that_they_are_made_of():
     assert text == definition(plain_type("autoware_perception_msgs/TrackedObjects"))
     for part in ("MSG: unique_identifier_msgs/UUID", "uint8[16] uuid", "MSG: builtin_interfaces/Time"):
         assert part in text
-    assert definition("std_msgs/String") is None
+    assert definition("other_msgs/String") is None

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from benchmarks.scans import SimulatedScans, laser_drive
-from data_tools.datasets.mcap.ros2_types import fields_of
 from data_tools.lidar import Scan
 from data_tools.recordings import RecordingOptions, open_recording, read_bag_laser
 from data_tools.recordings.bags import cloud_columns
@@ -251,11 +250,3 @@ def test_a_laser_without_wheels_is_refused(tmp_path: Path) -> None:
     messages = [message for message in laser_messages(log) if message[0] == "/scan"]
     with pytest.raises(InputError, match=r"a\.mcap: expected odometry of base_link, by nav_msgs/Odometry or /tf"):
         read_bag_laser(example.write_mcap(tmp_path / "a.mcap", messages))
-
-
-def test_definitions_are_those_of_ros() -> None:
-    """For bags that hold none."""
-    store = example.typestore()
-    for name in ("PointField", "PointCloud2", "LaserScan", "Imu", "NavSatStatus", "NavSatFix"):
-        theirs = [field for field, _ in store.fielddefs[f"sensor_msgs/msg/{name}"][1]]
-        assert [field.name for field in fields_of(f"sensor_msgs/{name}")] == theirs
