@@ -21,13 +21,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from data_tools.figures import FEWEST, Chart, FigureTable, Series, cell, count, distribution
+from data_tools.figures import FEWEST, Chart, Column, FigureTable, Series, cell, distribution
 from data_tools.metrics import (
     EllipseCoverage,
-    ErrorSummary,
     HotaMetrics,
     LabelErrors,
-    NuScenesClassMetrics,
     NuScenesTrackingMetrics,
     RecallCurves,
     SceneBoxes,
@@ -55,9 +53,18 @@ __all__ = [
     "evaluate_tracks",
 ]
 
+_CLASS = ("class",)
 _ERRORS = (
-    *("class", "labels", "with track", "position", "detection", "velocity", "velocity parked"),
-    *("velocity moving", "unknown", "heading", "flipped"),
+    Column("labels", "labels"),
+    Column("with track", "tracked"),
+    Column("position", "position"),
+    Column("detection", "detection"),
+    Column("velocity", "velocity"),
+    Column("velocity parked", "velocity_parked"),
+    Column("velocity moving", "velocity_moving"),
+    Column("unknown", "velocity_unknown"),
+    Column("heading", "heading", 1, 180 / np.pi),
+    Column("flipped", "flipped"),
 )
 _CALIBRATION = ("class", "objects", "boxes", "ANEES / 2", "median", "in 50 %", "in 90 %", "in 99 %", "verdict")
 
@@ -66,9 +73,7 @@ def error_tables(errors: LabelErrors) -> list[FigureTable]:
     """RMSE of tracks (and of detections) at the labels; and, if there are covariances, how well they fit."""
     classes = errors_by_class(errors)
     title = "RMSE at labels: position in m, velocity in m/s, heading in degrees"
-    tables = [
-        FigureTable(title, _ERRORS, tuple((name, *_error_cells(error_summary(e))) for name, e in classes.items()))
-    ]
+    tables = [FigureTable.of(title, _CLASS, _ERRORS, (((name,), error_summary(e)) for name, e in classes.items()))]
     calibrations = {name: calibration(e) for name, e in classes.items()}
     if any(c.boxes for c in calibrations.values()):
         title = "Calibration: share of errors within the tracks' ellipses; ANEES / 2 and median: 1 is right"
@@ -141,19 +146,6 @@ def recall_charts(curves: Mapping[str, RecallCurves]) -> list[Chart]:
     return charts
 
 
-def _error_cells(f: ErrorSummary) -> tuple[str, ...]:
-    errors = (f.position, f.detection, f.velocity, f.velocity_parked, f.velocity_moving)
-    heading = cell(float(np.degrees(f.heading)), 1)
-    return (
-        cell(f.labels),
-        cell(f.tracked),
-        *(cell(x) for x in errors),
-        cell(f.velocity_unknown),
-        heading,
-        cell(f.flipped),
-    )
-
-
 def _calibration_cells(c: EllipseCoverage) -> tuple[str, ...]:
     verdict = ("consistent" if c.consistent else "inconsistent") if c.enough_data else "too few boxes"
     shares = (cell(share) for share in c.coverage.values())
@@ -161,9 +153,12 @@ def _calibration_cells(c: EllipseCoverage) -> tuple[str, ...]:
 
 
 SIMILARITIES: dict[str, Similarity] = {"2D": "bev_iou", "3D": "iou_3d"}
-_HOTA_COLUMNS = (
-    *("class", "overlap", "score >=", "HOTA", "DetA", "AssA", "LocA", "MOTA", "MOTP", "IDS", "FRAG"),
-    *("IDF1", "IDP", "IDR"),
+_HOTA = (
+    Column("score >=", "threshold"),
+    *(Column(name, f"figures.{name.lower()}", 2, 100) for name in ("HOTA", "DetA", "AssA", "LocA", "MOTA", "MOTP")),
+    Column("IDS", "figures.ids"),
+    Column("FRAG", "figures.frag"),
+    *(Column(name, f"figures.{name.lower()}", 2, 100) for name in ("IDF1", "IDP", "IDR")),
 )
 
 
@@ -201,11 +196,8 @@ def _similarities(scenes: Sequence[tuple[SceneBoxes, SceneBoxes]]) -> dict[str, 
 
 def hota_table(rows: Sequence[HotaRow]) -> FigureTable:
     """Table for people, in percent as such figures are published."""
-    return FigureTable(
-        "HOTA, CLEAR and Identity, in %; pairs from an overlap of 0.5 on count for CLEAR and Identity",
-        _HOTA_COLUMNS,
-        tuple((row.label, row.overlap, cell(row.threshold), *_hota_cells(row.figures)) for row in rows),
-    )
+    title = "HOTA, CLEAR and Identity, in %; pairs from an overlap of 0.5 on count for CLEAR and Identity"
+    return FigureTable.of(title, (*_CLASS, "overlap"), _HOTA, (((row.label, row.overlap), row) for row in rows))
 
 
 def hota_json(rows: Sequence[HotaRow]) -> dict[str, Any]:
@@ -226,12 +218,6 @@ def mean_scores(track: IntArray | StrArray, score: FloatArray) -> FloatArray:
     """(N,) the mean score of each box's track."""
     _, number = np.unique(track, return_inverse=True)
     return np.asarray((np.bincount(number, weights=score) / np.maximum(np.bincount(number), 1))[number])
-
-
-def _hota_cells(f: HotaMetrics) -> tuple[str, ...]:
-    percent = (cell(100 * value, 2) for value in (f.hota, f.deta, f.assa, f.loca, f.mota, f.motp))
-    identity = (cell(100 * value, 2) for value in (f.idf1, f.idp, f.idr))
-    return (*percent, cell(f.ids), cell(f.frag), *identity)
 
 
 _INNOVATION_COLUMNS = ("class", "matches", "NIS / 2", "median", "in 50 %", "in 90 %", "in 99 %")
@@ -264,22 +250,17 @@ def _median(values: FloatArray) -> float:
 
 
 TITLE = "Over all scores, as in the nuScenes tracking task, without a limit of range; the rest at the best MOTA"
-_SWEEP_COLUMNS = (
-    *("class", "AMOTA", "AMOTP", "MOTA", "MOTP", "recall", "IDS", "FRAG", "TP", "FP", "FN", "GT", "MT", "ML"),
-    *("FAF", "TID", "LGD"),
+_SWEEP = (
+    *(Column(name, name.lower()) for name in ("AMOTA", "AMOTP", "MOTA", "MOTP", "recall")),
+    *(Column(name, name.lower(), 0) for name in ("IDS", "FRAG", "TP", "FP", "FN", "GT", "MT", "ML")),
+    *(Column(name, name.lower(), 2) for name in ("FAF", "TID", "LGD")),
 )
 
 
 def sweep_table(title: str, metrics: NuScenesTrackingMetrics) -> FigureTable:
     """The figures of the task, a row for all classes and one for each."""
-    rows = [("overall", metrics.overall), *metrics.per_class.items()]
-    return FigureTable(title, _SWEEP_COLUMNS, tuple((name, *_sweep_cells(figures)) for name, figures in rows))
-
-
-def _sweep_cells(f: NuScenesClassMetrics) -> tuple[str, ...]:
-    shares = (cell(value) for value in (f.amota, f.amotp, f.mota, f.motp, f.recall))
-    counts = (count(value) for value in (f.ids, f.frag, f.tp, f.fp, f.fn, f.gt, f.mt, f.ml))
-    return (*shares, *counts, *(cell(value, 2) for value in (f.faf, f.tid, f.lgd)))
+    rows = {"overall": metrics.overall, **metrics.per_class}
+    return FigureTable.of(title, _CLASS, _SWEEP, (((name,), figures) for name, figures in rows.items()))
 
 
 @part_kind("metric", "saga_fg.metrics")
@@ -347,9 +328,18 @@ def summary_table(sweep: NuScenesTrackingMetrics, errors: LabelErrors, hota: Seq
 _MOMENT_TITLE = (
     "Tracks at every moment; MOTP and errors in m; carried error: of the track that last followed a hidden object"
 )
-_MOMENT_COLUMNS = (
-    *("class", "MOTA", "MOTP", "recall", "IDS", "FP", "FN", "objects", "hidden", "hidden tracked"),
-    *("carried error", "carried error median"),
+_MOMENTS = (
+    Column("MOTA", "mota"),
+    Column("MOTP", "motp"),
+    Column("recall", "recall"),
+    Column("IDS", "switches"),
+    Column("FP", "false_positives"),
+    Column("FN", "misses"),
+    Column("objects", "objects"),
+    Column("hidden", "hidden_objects"),
+    Column("hidden tracked", "hidden_recall"),
+    Column("carried error", "carried.rmse"),
+    Column("carried error median", "carried.median"),
 )
 
 
@@ -456,8 +446,8 @@ def evaluate_tracks(
     thresholds = dict.fromkeys(pooled, 0.0) if swept is None else best_thresholds(swept)
     whole = {"overall": SceneMetrics.pool(pooled.values()), **pooled}
     return Evaluation(
-        tracking=FigureTable(
-            _MOMENT_TITLE, _MOMENT_COLUMNS, tuple((name, *_moment_cells(metrics)) for name, metrics in whole.items())
+        tracking=FigureTable.of(
+            _MOMENT_TITLE, _CLASS, _MOMENTS, (((name,), metrics) for name, metrics in whole.items())
         ),
         programs={
             "scenes": tuple(scene.name for scene, _ in results),
@@ -473,12 +463,6 @@ def evaluate_tracks(
 
 def _cells_of(figures: Mapping[str, float]) -> tuple[tuple[str, str], ...]:
     return tuple((name, cell(value)) for name, value in figures.items())
-
-
-def _moment_cells(m: SceneMetrics) -> tuple[str, ...]:
-    counts = (m.switches, m.false_positives, m.misses, m.objects, m.hidden_objects)
-    shares = (cell(m.mota), cell(m.motp), cell(m.recall))
-    return (*shares, *map(cell, counts), cell(m.hidden_recall), cell(m.carried.rmse), cell(m.carried.median))
 
 
 def _figures(m: SceneMetrics) -> dict[str, float]:

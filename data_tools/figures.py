@@ -6,13 +6,23 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass
 from itertools import cycle
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
 from data_tools.files import write_text
 from saga_fg.numerics import FloatArray
+
+
+class Column(NamedTuple):
+    """A column of figures: its title, the attribute that is shown, by dots, digits, and what it is multiplied by."""
+
+    title: str
+    attribute: str
+    digits: int = 3
+    scale: float = 1
 
 
 @dataclass(frozen=True)
@@ -22,6 +32,18 @@ class FigureTable:
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+
+    @classmethod
+    def of(
+        cls, title: str, heads: tuple[str, ...], columns: Sequence[Column], rows: Iterable[tuple[tuple[str, ...], Any]]
+    ) -> Self:
+        """A table of objects with figures, each after as many names as there are `heads`."""
+        shown = [(attrgetter(each.attribute), each) for each in columns]
+        cells = (
+            (*names, *(cell(each.scale * figure(found), each.digits) for figure, each in shown))
+            for names, found in rows
+        )
+        return cls(title, (*heads, *(each.title for each in columns)), tuple(cells))
 
     def markdown(self) -> str:
         """The table in Markdown, its title in bold above it."""

@@ -59,10 +59,11 @@ from data_tools.datasets.source import (
     TrackedScenes,
     names,
     option,
+    require_measured,
     tracks_of,
 )
 from data_tools.evaluation import Evaluation, HotaRow, mean_scores
-from data_tools.figures import FigureTable, cell
+from data_tools.figures import Column, FigureTable
 from data_tools.files import atomic_directory, is_url
 from data_tools.metrics import (
     KittiSimilarity,
@@ -104,15 +105,7 @@ def write_kitti_results(
     writable, tracks that do not fit the scene, a size or heading that is unknown, a class KITTI does not have.
     """
     with atomic_directory(directory) as folder:
-
-        def written() -> Iterator[tuple[Scene, Sequence[Tracks]]]:
-            for scene, moments in scenes:
-                with error_context(f"{directory}: sequence {scene.name}"):
-                    text = kitti_result_text(scene, moments, dataset.calibration(scene.name))
-                (folder / f"{scene.name}.txt").write_text(text, encoding="utf-8")
-                yield scene, moments
-
-        write_tracks(folder / table, written())
+        write_tracks(folder / table, _written(folder, dataset, scenes))
 
 
 def write_kitti_labels(
@@ -124,11 +117,19 @@ def write_kitti_labels(
     or heading that is unknown, a class KITTI does not have.
     """
     with atomic_directory(directory) as folder:
-        for scene, moments in scenes:
-            tracks = [moment.tracks for moment in moments]
-            with error_context(f"{directory}: sequence {scene.name}"):
-                text = kitti_result_text(scene, tracks, dataset.calibration(scene.name), with_score=False)
-            (folder / f"{scene.name}.txt").write_text(text, encoding="utf-8")
+        for _ in _written(folder, dataset, tracks_of(scenes), with_score=False):
+            pass
+
+
+def _written(
+    folder: Path, dataset: KittiTracking, scenes: TrackedScenes, with_score: bool = True
+) -> Iterator[tuple[Scene, Sequence[Tracks]]]:
+    """Write the text of each sequence, and pass it on."""
+    for scene, moments in scenes:
+        with error_context(f"sequence {scene.name}"):
+            text = kitti_result_text(scene, moments, dataset.calibration(scene.name), with_score)
+        (folder / f"{scene.name}.txt").write_text(text, encoding="utf-8")
+        yield scene, moments
 
 
 def kitti_result_text(
@@ -140,42 +141,24 @@ def kitti_result_text(
     """The lines of one sequence; without the score they are those of a label file."""
     if len(moments) != len(scene):
         raise InputError(f"expected tracks for {len(scene)} frames, got {len(moments)}")
-    imu_T_camera = inverse_transform(calibration.camera_T_imu)
     lines: list[str] = []
+    imu_T_camera = inverse_transform(calibration.camera_T_imu)
     for frame, (tracks, world_T_imu) in enumerate(zip(moments, scene.world_T_ego, strict=True)):
-        lines += _lines(frame, tracks, world_T_imu @ imu_T_camera, calibration, with_score)
+        for label in tracks.boxes.label.tolist():
+            if label not in _TYPE_OF_LABEL:
+                raise InputError(f"frame {frame}: {unknown_name('class', label, tuple(_TYPE_OF_LABEL))}")
+        require_measured(tracks, f"frame {frame}")
+        boxes = world_boxes_to_camera(tracks.boxes, world_T_imu @ imu_T_camera)
+        bbox = image_boxes(boxes, calibration.projection, IMAGE_SIZE)
+        columns = [observation_angles(boxes), bbox, boxes.size, boxes.location, boxes.rotation_y]
+        numbers = np.column_stack([*columns, tracks.score] if with_score else columns)
+        names = zip(tracks.id.tolist(), tracks.boxes.label.tolist(), strict=True)
+        lines += [
+            f"{frame} {id_} {_TYPE_OF_LABEL[label]} 0 0 {' '.join(f'{x:.6f}' for x in row)}\n"
+            for (id_, label), row, shows in zip(names, numbers.tolist(), np.isfinite(bbox[:, 0]).tolist(), strict=True)
+            if shows
+        ]
     return "".join(lines)
-
-
-def _lines(
-    frame: int,
-    tracks: Tracks,
-    world_T_camera: FloatArray,
-    calibration: Calibration,
-    with_score: bool,
-) -> list[str]:
-    types = [_type(frame, label) for label in tracks.boxes.label.tolist()]
-    unmeasured = ~np.isfinite(tracks.boxes.size).all(axis=1) | ~np.isfinite(tracks.boxes.yaw)
-    if unmeasured.any():
-        id_ = int(tracks.id[np.argmax(unmeasured)])
-        raise InputError(f"frame {frame}: track {id_}: expected a known size and heading, the format requires them")
-    boxes = world_boxes_to_camera(tracks.boxes, world_T_camera)
-    bbox = image_boxes(boxes, calibration.projection, IMAGE_SIZE)
-    columns = [observation_angles(boxes), bbox, boxes.size, boxes.location, boxes.rotation_y]
-    numbers = np.column_stack([*columns, tracks.score] if with_score else columns)
-    return [
-        f"{frame} {id_} {type_} 0 0 {' '.join(f'{x:.6f}' for x in row)}\n"
-        for id_, type_, row, shows in zip(
-            tracks.id.tolist(), types, numbers.tolist(), np.isfinite(bbox[:, 0]).tolist(), strict=True
-        )
-        if shows
-    ]
-
-
-def _type(frame: int, label: str) -> str:
-    if label not in _TYPE_OF_LABEL:
-        raise InputError(f"frame {frame}: {unknown_name('class', label, tuple(_TYPE_OF_LABEL))}")
-    return _TYPE_OF_LABEL[label]
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,8 +265,13 @@ CLASSES = ("car", "pedestrian", "cyclist")
 IOUS = (0.25, 0.5, 0.7)
 REACH = 5  # frames to either side for a label's velocity, 0.5 s
 _COLUMNS = (
-    *("class", "3D IoU", "sAMOTA", "safe", "AMOTA", "AMOTP", "MOTA", "MOTP", "IDS", "FRAG", "recall", "precision"),
-    *("TP", "FP", "FN", "GT", "MT", "ML"),
+    Column("sAMOTA", "samota", 2, 100),
+    Column("safe", "samota_safe", 2, 100),
+    *(Column(name, name.lower(), 2, 100) for name in ("AMOTA", "AMOTP", "MOTA", "MOTP")),
+    *(Column(name, name.lower()) for name in ("IDS", "FRAG")),
+    *(Column(name, name, 2, 100) for name in ("recall", "precision")),
+    *(Column(name, name.lower()) for name in ("TP", "FP", "FN", "GT")),
+    *(Column(name, name.lower(), 2, 100) for name in ("MT", "ML")),
 )
 SIMILARITIES: dict[str, KittiSimilarity] = {"image": "image", "2D": "bev_iou", "3D": "iou_3d"}
 ByIou = Mapping[float, KittiTrackingMetrics]
@@ -341,17 +329,8 @@ def _surer_lines(found: KittiObjects, label: str, threshold: float) -> KittiObje
 
 def kitti_table(title: str, tracking: Mapping[str, ByIou]) -> FigureTable:
     """A row for each class and overlap."""
-    rows = ((label, f"{iou:g}", f) for label, by_iou in tracking.items() for iou, f in by_iou.items())
-    return FigureTable(title, _COLUMNS, tuple((label, iou, *_cells(f)) for label, iou, f in rows))
-
-
-def _cells(f: KittiTrackingMetrics) -> tuple[str, ...]:
-    def percent(*values: float) -> tuple[str, ...]:
-        return tuple(cell(100 * value, 2) for value in values)
-
-    counts = (cell(value) for value in (f.tp, f.fp, f.fn, f.gt))
-    first = percent(f.samota, f.samota_safe, f.amota, f.amotp, f.mota, f.motp)
-    return (*first, cell(f.ids), cell(f.frag), *percent(f.recall, f.precision), *counts, *percent(f.mt, f.ml))
+    rows = (((label, f"{iou:g}"), f) for label, by_iou in tracking.items() for iou, f in by_iou.items())
+    return FigureTable.of(title, ("class", "3D IoU"), _COLUMNS, rows)
 
 
 class KittiFormat(ResultFormat):
