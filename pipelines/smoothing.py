@@ -32,14 +32,18 @@ from typing import Any
 import numpy as np
 
 from data_tools.datasets.corrections import Outcomes, write_outcomes
-from data_tools.datasets.detection_files import write_label_table, write_review
+from data_tools.datasets.detection_files import TrackRows, write_label_table, write_review
 from data_tools.datasets.given_tracks import GivenTracks, sensor_names
+from data_tools.datasets.results import table_results
+from data_tools.evaluation import Evaluation, evaluate_tracks
 from data_tools.figures import write_figures
 from data_tools.files import atomic_directory
+from data_tools.metrics import SceneBoxes
 from pipelines.config import Method, TrackConfig, load_config, shipped_settings
 from pipelines.configuration import load_settings, read_settings
 from pipelines.report.page import RunRecord, write_run_record
-from pipelines.tracking import Progress, one_thread, scene_with_frames
+from pipelines.tracking import Progress, one_thread, scene_with_frames, track_scene
+from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
 from saga_fg.model import ScoreCalibration, Sensor, sensor_model
 from saga_fg.settings import settings_group
@@ -296,3 +300,33 @@ def write_labels(
         if write_others is not None:
             write_others(folder, [part for run in done for part in run.parts])
     return done
+
+
+def evaluate_labels(
+    rows: TrackRows,
+    table: Path,
+    dataset: Dataset,
+    config: SmoothConfig,
+    method: Method = "saga",
+    progress: Progress | None = None,
+) -> dict[str, Evaluation]:
+    """Judge labels, and online tracks that are made anew as `config` says, by the dataset they were made of.
+
+    rows   of the table of labels, whose scenes are judged; table: its file, for errors
+
+    Errors are those at the true objects that a detection matches. Of the table, the moments nearest to the ground truth
+    count. Raises `InputError` for an empty table, and for scenes and moments that the dataset does not have, or without
+    ground truth.
+    """
+    if not len(rows.source):
+        raise InputError(f"{table}: expected labels, there are none")
+    online, labels = [], []
+    for name, found in table_results(rows, table, dataset, judged=True).items():
+        scene = found.scene
+        if scene.ground_truth is None:
+            raise InputError(f"scene {name}: expected ground truth, there is none")
+        tracked = track_scene(scene, config.tracking.new_tracker(method), progress)
+        online.append((scene, SceneBoxes.of_tracks(tracked.tracks)))
+        labels.append((scene, found.found))
+    systems = {"online": online, "labels": labels}
+    return {name: evaluate_tracks(each, sweep=True, detected=True) for name, each in systems.items()}

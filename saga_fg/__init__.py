@@ -11,7 +11,7 @@ import lazy_loader
 _attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __version__ = version("saga-fg")
 
-ABOVE = {"evaluate": "data_tools.datasets.data_frames:evaluate", "view": "pipelines.report.data_frames:view"}
+ABOVE = {"evaluate": "data_tools.datasets.detection_file_source:evaluate", "view": "pipelines.report.page:view"}
 """Functions of packages above this one, found by name when they are first asked for, as the command is."""
 
 

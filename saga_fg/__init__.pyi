@@ -1,5 +1,5 @@
-import data_tools.datasets.data_frames as _judged
-import pipelines.report.data_frames as _shown
+import data_tools.datasets.detection_file_source as _judged
+import pipelines.report.page as _shown
 
 from .errors import InputError, MissingExtraError, SagaError, UnknownNodeError
 from .model.motion import ConstantAcceleration, ConstantVelocity, Curvilinear, NodeType, RandomWalk

@@ -1,17 +1,23 @@
-"""Tables of detections as a dataset of the command."""
+"""Tables of your own: of detections as a dataset of the command, and of tracks and true objects of a program."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from data_tools.datasets import import_options
-from data_tools.datasets.detection_files import TableImport, TruthTable, read_tracks, read_truth
-from data_tools.datasets.detection_files.dataset import dense_traffic_of, read_detections, read_scenes_in_parts
+from data_tools.datasets.detection_files import TableImport, TrackRows, TruthTable, read_tracks, read_truth, track_rows
+from data_tools.datasets.detection_files.dataset import (
+    TRUTH_COLUMNS,
+    dense_traffic_of,
+    read_detections,
+    read_scenes_in_parts,
+)
+from data_tools.datasets.detection_files.tracks import OWN, TRACK_REQUIRED
 from data_tools.datasets.results import Results, SceneResult, clear_figures, nearest_rows, table_results
 from data_tools.datasets.source import (
     TRACKING,
@@ -26,16 +32,32 @@ from data_tools.datasets.source import (
 )
 from data_tools.files import expanded, local_copy, name_of
 from saga_fg.errors import InputError
-from saga_fg.tables import pairs
+from saga_fg.tables import NAME, SETTLED, TRACK_COLUMNS, DetectionTable, Table, pairs, raw_table, tell
 from saga_fg.types import Dataset, Scene
 
 if TYPE_CHECKING:
-    from data_tools.evaluation import Evaluation
+    from data_tools.evaluation import Evaluation, Metric
     from saga_fg.numerics import FloatArray
     from saga_fg.types import Mend
 
 JUDGED: tuple[Verb, ...] = ("evaluate", "evaluate labels", "report", "view")
 """Verbs that compare with true objects."""
+COLUMNS_TEXT = (
+    "Names of columns in the file, where they are not found: time=ts_ns,x=pos_x,yaw=hdg. `length=` leaves one out."
+)
+CLASSES_TEXT = "Names of classes: REGULAR_VEHICLE=car,PERSON=pedestrian. `SIGN=` leaves a class out."
+UNITS_TEXT = (
+    "Units: time=ns (s, ms, us, ns, iso8601, 10Hz), length=ft (m, cm, mm, km, ft), speed=km/h (m/s, km/h, mph, "
+    "ft/s), angle=deg (rad, deg; clockwise, clockwise_deg; compass, compass_rad: clockwise from north), score=percent "
+    "(share, percent). Of one column: yaw=deg."
+)
+COORDINATES_TEXT = (
+    "Coordinates of rows that say none; all but world need the pose of the vehicle. camera: at its origin, x to the "
+    "right, y down, z ahead.  [default: world]"
+)
+SORT_TEXT = "Sort the rows by time, in memory."
+AS_GIVEN_TEXT = "Read the table as it is said to be, even where its contents contradict it."
+IMPORT_TEXT = "YAML file with the same: columns, classes, units, coordinates, sort, as_given."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,30 +94,30 @@ class DetectionFileSource(DatasetSource):
         verbs=JUDGED,
     )
     columns: str | None = option(
-        import_options.COLUMNS,
+        COLUMNS_TEXT,
         None,
         metavar="OURS=THEIRS,...",
     )
     classes: str | None = option(
-        import_options.CLASSES,
+        CLASSES_TEXT,
         None,
         metavar="THEIRS=OURS,...",
     )
     units: str | None = option(
-        import_options.UNITS,
+        UNITS_TEXT,
         None,
         metavar="KIND=UNIT,...",
     )
-    coordinates: Literal["world", "ego", "sensor", "camera"] | None = option(import_options.COORDINATES, None)
-    sort: bool = option(import_options.SORT, False)
-    as_given: bool = option(import_options.AS_GIVEN, False)
+    coordinates: Literal["world", "ego", "sensor", "camera"] | None = option(COORDINATES_TEXT, None)
+    sort: bool = option(SORT_TEXT, False)
+    as_given: bool = option(AS_GIVEN_TEXT, False)
     like: Literal["plain", "dense"] | None = option(
         "Settings to begin with: dense for road traffic seen by a sensor that stands or hovers, plain for all else.  "
         "[default: what the first rows look like]",
         None,
         verbs=("track",),
     )
-    table_import: TableImport | None = option(import_options.IMPORT, None, flag="--import", metavar="FILE")
+    table_import: TableImport | None = option(IMPORT_TEXT, None, flag="--import", metavar="FILE")
     truth_import: TableImport | None = option(
         "YAML file with the same, for --truth alone.", None, flag="--truth-import", metavar="FILE", verbs=JUDGED
     )
@@ -274,3 +296,57 @@ class DetectionFilePart:
         """Open with the digest of the file."""
         with local_copy(self.url) as path:
             yield OpenedPart({name_of(self.url): file_digest(path)}, lambda: read_detections(path, self.how))
+
+
+_DEPTH = 6  # callers between a warning and the program
+
+
+def evaluate(
+    tracks: Table,
+    truth: Table,
+    how: TableImport | None = None,
+    truth_how: TableImport | None = None,
+    metrics: Sequence[str | Metric] = (),
+    hota: bool | None = None,
+) -> Evaluation:
+    """Judge a table of tracks by one of true objects, as `saga-fg evaluate file TRACKS --truth TRUTH` does.
+
+    tracks     a row for each and moment: timestamp, id, x, y, and where known label, score, sizes, covariances, scene,
+               of `saga_fg.track` or of any tracker; pandas, Polars or Arrow
+    truth      the same of true objects; `visible` 0 where hidden
+    how        what it takes to understand the tables, without effect on tracks of saga-fg; truth_how: that of the truth
+    metrics    of your own, as objects or names
+    hota       whether HOTA is computed, which needs the extra [eval]; None: where that is installed
+
+    Warns (`UserWarning`) of what is doubtful. Raises `InputError` for tables that cannot be used or do not fit.
+    """
+    results = found_results(tracks, truth=truth, how=how, truth_how=truth_how)
+    score = partial(clear_figures, sweep=True)
+    return Results(results, score).evaluate(find_spec("trackeval") is not None if hota is None else hota, None, metrics)
+
+
+def found_results(
+    tracks: Table,
+    detections: Table | None = None,
+    truth: Table | None = None,
+    how: TableImport | None = None,
+    truth_how: TableImport | None = None,
+) -> dict[str, SceneResult]:
+    """The tracks of a table by scene, beside detections and true objects where these are given; else as `evaluate`."""
+    names = set(getattr(tracks, "column_names", getattr(tracks, "columns", ())))  # of Arrow, or of the others
+    rows = _rows(tracks, TableImport(as_given=True) if names >= OWN else how)
+    dataset: Dataset | None = None
+    if detections is not None:
+        dataset = DetectionTable(raw_table(detections, how))
+    if truth is not None:
+        within = "how" if truth_how is None else "truth_how"
+        raw = raw_table(truth, truth_how or how, TRUTH_COLUMNS, TRACK_REQUIRED, within)
+        true = TruthTable.from_table(raw, partial(tell, depth=_DEPTH))
+        dataset = true if dataset is None else DetectedTruth(true, dataset)
+    return table_results(
+        rows, Path(NAME), dataset, how=how, judged=truth is not None, own_times=truth is None and dataset is not None
+    )
+
+
+def _rows(tracks: Table, how: TableImport | None) -> TrackRows:
+    return track_rows(raw_table(tracks, how, (*TRACK_COLUMNS, SETTLED), TRACK_REQUIRED), partial(tell, depth=_DEPTH))

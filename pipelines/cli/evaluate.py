@@ -1,6 +1,7 @@
 """`saga-fg evaluate` and `saga-fg benchmark`: how good are tracks and labels?"""
 
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -11,7 +12,8 @@ import typer
 from data_tools.datasets.detection_files import read_tracks
 from data_tools.datasets.results import Results
 from data_tools.datasets.source import DatasetSource, Innovations, input_files
-from data_tools.evaluation import LEGEND
+from data_tools.evaluation import LEGEND, Evaluation
+from data_tools.figures import write_figures
 from data_tools.files import write_text, write_zip
 from pipelines.checks import CheckedDataset, Checks
 from pipelines.cli import options
@@ -19,9 +21,9 @@ from pipelines.cli.console import JsonFile, MarkdownFile, progress_bar, report, 
 from pipelines.cli.options import ScaleOptions, TrackerOptions, dataset_commands
 from pipelines.cli.track import exit_on_failures, run_at_scale
 from pipelines.config import Method, TrackConfig
-from pipelines.evaluation import evaluate_labels, judge_run
+from pipelines.report.page import RunRecord, report_page, result_report, write_run_record
 from pipelines.scale_out import TrackTask
-from pipelines.smoothing import load_smooth_config
+from pipelines.smoothing import evaluate_labels, load_smooth_config
 from pipelines.tracking import InnovationRecorder, track_dataset
 from saga_fg.errors import InputError
 
@@ -190,11 +192,35 @@ def _benchmark(
         submission = write_zip(output / "submission.zip", files) if files else None
     if not without_truth:
         with working("scoring"):
-            evaluation = judge_run(source, output, tracker.method, task.configuration, hota)
+            evaluation = _judged(source, output, tracker.method, task.configuration, hota)
         show_tables(list(evaluation.tables())[:1])
         typer.echo(f"{output / 'figures.json'}: all figures; {output / 'report.html'}: a page of them")
     if submission is not None:
         typer.echo(f"{submission}: for the official server")
+
+
+SHOWN = 3  # scenes in the player: a page of them all would be too large
+
+
+def _judged(source: DatasetSource, output: Path, method: str, configuration: str, hota: bool) -> Evaluation:
+    """Score the tracks of all scenes of a run in a folder; figures.json and report.html appear in it.
+
+    configuration: YAML of the run. Raises `InputError` for results that do not fit the ground truth.
+    """
+    result = output / source.written.all_tracks
+    write_run_record(result, RunRecord(method, configuration, {}))
+    found = source.read_results(result)
+    evaluation, names = found.evaluate(hota), list(found.scenes)
+    figures = {"method": method, "version": version("saga-fg"), "figures": evaluation.figures()}
+    write_figures(output / "figures.json", figures)
+    some = result_report(source.restricted(names[:SHOWN]), result)
+    boxes = sum(len(each.found) for each in found.scenes.values())
+    facts = [f"{len(names)} scenes, {boxes} boxes", f"saga-fg {version('saga-fg')}"]
+    notes = [f"The player shows {SHOWN} of {len(names)} scenes."] if len(names) > SHOWN else []
+    tables, charts = evaluation.tables(), evaluation.charts()
+    page = replace(some, facts=facts, notes=[*notes, *some.notes], tables=tables, charts=charts)
+    write_text(output / "report.html", report_page(page))
+    return evaluation
 
 
 benchmark_app = dataset_commands(

@@ -9,7 +9,14 @@ from typing import Annotated, Literal
 
 import typer
 
-from data_tools.datasets import import_options
+from data_tools.datasets.detection_file_source import (
+    CLASSES_TEXT,
+    COLUMNS_TEXT,
+    COORDINATES_TEXT,
+    IMPORT_TEXT,
+    SORT_TEXT,
+    UNITS_TEXT,
+)
 from data_tools.datasets.detection_files import TableImport
 from data_tools.datasets.detection_files.dataset import TableSurvey, survey_table
 from data_tools.figures import write_figures
@@ -35,22 +42,22 @@ def inspect_table(
     ],
     columns: Annotated[
         str | None,
-        typer.Option("--columns", help=import_options.COLUMNS, metavar="OURS=THEIRS,..."),
+        typer.Option("--columns", help=COLUMNS_TEXT, metavar="OURS=THEIRS,..."),
     ] = None,
     classes: Annotated[
         str | None,
-        typer.Option("--classes", help=import_options.CLASSES, metavar="THEIRS=OURS,..."),
+        typer.Option("--classes", help=CLASSES_TEXT, metavar="THEIRS=OURS,..."),
     ] = None,
     units: Annotated[
         str | None,
-        typer.Option("--units", help=import_options.UNITS, metavar="KIND=UNIT,..."),
+        typer.Option("--units", help=UNITS_TEXT, metavar="KIND=UNIT,..."),
     ] = None,
     coordinates: Annotated[
         Literal["world", "ego", "sensor", "camera"] | None,
-        typer.Option("--coordinates", help=import_options.COORDINATES),
+        typer.Option("--coordinates", help=COORDINATES_TEXT),
     ] = None,
-    sort: Annotated[bool, typer.Option("--sort", help=import_options.SORT)] = False,
-    import_file: Annotated[Path | None, typer.Option("--import", help=import_options.IMPORT, metavar="FILE")] = None,
+    sort: Annotated[bool, typer.Option("--sort", help=SORT_TEXT)] = False,
+    import_file: Annotated[Path | None, typer.Option("--import", help=IMPORT_TEXT, metavar="FILE")] = None,
     verbose: Verbose = False,
 ) -> None:
     """Look at a table: its columns, units, classes, times, what looks wrong, and the command to run next.

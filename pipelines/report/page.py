@@ -14,6 +14,7 @@ import json
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
@@ -21,8 +22,9 @@ from typing import Any
 
 import numpy as np
 
+from data_tools.datasets.detection_file_source import found_results
 from data_tools.datasets.detection_files import read_predictions
-from data_tools.datasets.results import Results
+from data_tools.datasets.results import Results, clear_figures
 from data_tools.datasets.source import DatasetSource
 from data_tools.figures import COLOURS, Chart, FigureTable, as_json, class_colours
 from data_tools.files import parsed_json, read_bytes, write_text
@@ -31,6 +33,7 @@ from pipelines.explaining import clock_table, journal_of, read_yields
 from pipelines.report.figures import UNSEEN, latency_chart, track_charts, track_figures
 from pipelines.report.scenes import ReportScene, comparisons, scene_data, start_thresholds, thumbnails
 from saga_fg.errors import InputError
+from saga_fg.tables import Table, TableImport
 from saga_fg.tracking import SensorTime
 
 SCRIPTS = ("charts", "road", "fans", "layers", "filters", "panel", "visits", "review", "player")
@@ -302,3 +305,60 @@ def result_figures(found: Results, with_truth: bool) -> tuple[list[FigureTable],
         return list(evaluation.tables()), evaluation.charts()
     results = list(found.scenes.values())
     return [track_figures(results)], track_charts(results)
+
+
+_HEIGHT = 720  # of the frame in a notebook, pixels
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page of results, one HTML text that needs no network: a notebook shows it, `write` makes a file of it."""
+
+    title: str
+    text: str
+
+    def __repr__(self) -> str:
+        """Title and size, and how to look at it."""
+        return (
+            f"{self.title}: a page of {len(self.text) / 1e6:.1f} MB; a notebook shows it, .write('page.html') saves it"
+        )
+
+    def _repr_html_(self) -> str:
+        """The page in a frame of its own."""
+        return f'<iframe srcdoc="{html.escape(self.text)}" width="100%" height="{_HEIGHT}"></iframe>'
+
+    def write(self, path: str | Path) -> None:
+        """Write the page, whole or not at all. Raises `InputError` for a name that does not end in .html."""
+        if Path(path).suffix not in (".html", ".htm"):
+            raise InputError(f"{path}: expected a file name that ends in .html")
+        write_text(path, self.text)
+
+
+def view(
+    tracks: Table,
+    detections: Table | None = None,
+    truth: Table | None = None,
+    how: TableImport | None = None,
+    truth_how: TableImport | None = None,
+) -> Page:
+    """Return a page of a table of tracks: a player, figures and charts, as `saga-fg report file` makes it.
+
+    detections, truth  tables to show beside the tracks; with `truth` the figures are of errors
+    tracks, how, truth_how  as of `saga_fg.evaluate`, which also says what is warned of and raised
+    """
+    results = found_results(tracks, detections, truth, how, truth_how)
+    config = load_config("file")
+    scenes = [
+        ReportScene(
+            each.scene,
+            {"tracks": each.found},
+            {} if each.coasting is None else {"tracks": each.coasting},
+            config.tracker.edges,
+            config.sensors,
+        )
+        for each in results.values()
+    ]
+    tables, charts = result_figures(Results(results, partial(clear_figures, sweep=True)), truth is not None)
+    boxes = sum(len(each.found) for each in results.values())
+    title = f"{len(scenes)} scene{'s' if len(scenes) != 1 else ''}, {boxes} boxes"
+    return Page(title, report_page(Report("Tracks", [title], scenes, tables, charts)))
