@@ -39,7 +39,7 @@ from saga_fg.numerics import (
     geometry,
     quaternion_norms,
     quaternion_rotation,
-    refuse,
+    rigid_transforms,
     rotation_quaternion,
 )
 from saga_fg.slam.pose_graph import (
@@ -140,10 +140,7 @@ def transforms(table: TextTable, record: Record) -> FloatArray:
     table.check(
         np.abs(norm - 1) <= _UNIT, lambda row: f"qx qy qz qw: expected a unit quaternion, got norm {norm[row]:.6g}"
     )
-    T = np.tile(np.eye(4), (len(values), 1, 1))
-    T[:, :3, :3] = quaternion_rotation(quaternion / norm[:, None])
-    T[:, :3, 3] = values[:, :3]
-    return T
+    return rigid_transforms(quaternion_rotation(quaternion / norm[:, None]), values[:, :3])
 
 
 def information(table: TextTable, record: Record) -> FloatArray:

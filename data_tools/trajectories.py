@@ -63,6 +63,7 @@ from saga_fg.numerics import (
     quaternion_norms,
     quaternion_rotation,
     refuse,
+    rigid_transforms,
 )
 
 __all__ = [
@@ -290,13 +291,12 @@ def read_kitti_poses(path: str | Path, times: str | Path | None = None, period: 
     table = read_table(Path(path), (12,), "r11 r12 r13 tx r21 ... tz")
     if not len(table):
         raise InputError(f"{path}: expected a pose per line, the file is empty")
-    poses = np.tile(np.eye(4), (len(table), 1, 1))
-    poses[:, :3] = table.numbers(slice(0, 12), _KITTI_COLUMNS).reshape(-1, 3, 4)
+    rows = table.numbers(slice(0, 12), _KITTI_COLUMNS).reshape(-1, 3, 4)
     timestamps = (
         np.arange(len(table), dtype=np.float64) * period if times is None else _read_times(Path(times), len(table))
     )
     with error_context(str(path)):
-        return Trajectory(timestamps, poses)
+        return Trajectory(timestamps, rigid_transforms(rows[:, :, :3], rows[:, :, 3]))
 
 
 def write_kitti_poses(path: str | Path, trajectory: Trajectory, times: str | Path | None = None) -> None:
@@ -327,11 +327,9 @@ def read_tum_poses(path: str | Path) -> Trajectory:
     norm = quaternion_norms(numbers[:, 4:])
     expected = "qx qy qz qw: expected a unit quaternion"
     refuse(np.abs(norm - 1) > _UNIT, lambda row: table.fault(row, f"{expected}, got norm {norm[row]:.6g}"))
-    poses = np.tile(np.eye(4), (len(table), 1, 1))
-    poses[:, :3, :3] = quaternion_rotation(numbers[:, [7, 4, 5, 6]] / norm[:, None])
-    poses[:, :3, 3] = numbers[:, 1:4]
+    rotation = quaternion_rotation(numbers[:, [7, 4, 5, 6]] / norm[:, None])
     with error_context(str(path)):
-        return Trajectory(numbers[:, 0], poses)
+        return Trajectory(numbers[:, 0], rigid_transforms(rotation, numbers[:, 1:4]))
 
 
 def write_tum_poses(path: str | Path, trajectory: Trajectory) -> None:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
+from importlib.util import find_spec
 
 
 class SagaError(Exception):
@@ -29,6 +30,13 @@ class UnknownNodeError(SagaError, KeyError):
 
 class MissingExtraError(SagaError, ImportError):
     """An optional dependency is not installed; the text names the extra that brings it."""
+
+
+def require_extra(extra: str, what: str, *modules: str) -> None:
+    """Raise `MissingExtraError` where a module that something needs is not installed; `extra` brings it."""
+    for name in modules:
+        if find_spec(name) is None:
+            raise MissingExtraError(f"{what} needs {name}: pip install 'saga-fg[{extra}]'")
 
 
 class KernelError(SagaError, RuntimeError):

@@ -40,7 +40,7 @@ import numpy as np
 
 from data_tools.files import open_bytes
 from saga_fg.errors import InputError, unknown_name
-from saga_fg.numerics import FloatArray
+from saga_fg.numerics import FloatArray, refuse
 from saga_fg.parts import find, names_of, part_kind
 from saga_fg.types import Dataset, Scene
 
@@ -86,11 +86,9 @@ class Part(Protocol):
     @property
     def name(self) -> str:
         """Unique within a run; results and the manifest are named for it."""
-        ...
 
     def opened(self) -> AbstractContextManager[OpenedPart]:
         """Make the part available for the length of a block; raises `InputError` where it is not."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,6 +252,13 @@ def input_files(source: DatasetSource) -> tuple[Path, ...]:
     texts = [text for value in values for text in (value if isinstance(value, list) else [value])]
     places = [place for text in texts if isinstance(text, str) for place in (text, text.partition("=")[2])]
     return tuple(Path(place) for place in places if os.path.isfile(place))  # noqa: PTH113 (stands any text)
+
+
+def require_measured(tracks: Tracks, where: str) -> None:
+    """Raise `InputError` for a track without a size or heading, for formats that hold boxes alone."""
+    unmeasured = ~np.isfinite(tracks.boxes.size).all(axis=1) | ~np.isfinite(tracks.boxes.yaw)
+    expected = "expected a known size and heading, the format requires them"
+    refuse(unmeasured, lambda row: InputError(f"{where}: track {tracks.id[row]}: {expected}"))
 
 
 class ResultFormat:

@@ -26,13 +26,12 @@ import zipfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from glob import glob, has_magic
-from importlib.util import find_spec
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, TextIO, TypeVar
 from urllib.parse import urlsplit
 
 from data_tools.files.isolated_reading import isolated, one_line
-from saga_fg.errors import InputError, MissingExtraError
+from saga_fg.errors import InputError, MissingExtraError, require_extra
 
 _COMPRESSED = {
     b"BZh": "bzip2",
@@ -184,8 +183,7 @@ def _remote(reader: Callable[..., Iterator[T]], url: str, *arguments: Any) -> It
         known = ", ".join(PROTOCOLS)
         got = f"{protocol}://" if protocol not in PROTOCOLS else "a chain"
         raise InputError(f"{url}: expected a URL of one protocol, one of {known}, got {got}")
-    if find_spec("fsspec") is None:
-        raise MissingExtraError(f'{url}: URLs need fsspec; pip install "saga-fg[remote]"')
+    require_extra("remote", f"{url}: a URL", "fsspec")
     if protocol == "memory":  # of this process, a child has none
         with one_line(_PROBLEM, url):
             yield from reader(url, *arguments)

@@ -14,7 +14,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import date
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
 
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 
 from data_tools.files.file_access import open_bytes, open_text, read_text
 from data_tools.files.isolated_reading import isolated
-from saga_fg.errors import InputError, MissingExtraError, error_context
+from saga_fg.errors import InputError, error_context, require_extra
 from saga_fg.numerics import BoolArray, FloatArray, refuse
 
 LONGEST = 100  # characters of a value
@@ -320,8 +319,7 @@ def arrow_names(path: Path) -> list[str]:
     Raises `InputError` for a file that is not readable or has two columns of one name, `MissingExtraError` without
     pyarrow.
     """
-    if find_spec("pyarrow") is None:
-        raise MissingExtraError(f"{path}: {_kind(path)} needs pyarrow: pip install 'saga-fg[parquet]'")
+    require_extra("parquet", f"{path}: {_kind(path)}", "pyarrow")
     (names,) = isolated(f"expected a readable {_kind(path)} file", _names, path)
     if len(set(names)) != len(names):
         raise InputError(f"{path}: expected every column once, got {', '.join(name[:40] for name in names)[:500]}")

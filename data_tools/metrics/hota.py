@@ -20,7 +20,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from data_tools.metrics.scene_boxes import SceneBoxes
-from saga_fg.errors import InputError, MissingExtraError
+from saga_fg.errors import InputError, require_extra
 from saga_fg.numerics import FloatArray, IntArray, StrArray
 from saga_fg.types import Boxes, bev_iou, iou_3d
 
@@ -98,7 +98,9 @@ def hota_metrics(
 
 def similarity_metrics(scenes: Sequence[SceneSimilarities], threshold: float = 0.5) -> HotaMetrics:
     """The figures of scenes whose similarities are known. Raises `MissingExtraError` without trackeval."""
-    metrics = _trackeval_metrics()
+    require_extra("eval", "HOTA", "trackeval")
+    from trackeval import metrics
+
     options = {"THRESHOLD": threshold, "PRINT_CONFIG": False}
     hota, clear, identity = metrics.HOTA(), metrics.CLEAR(options), metrics.Identity(options)
     sequences = [scene.sequence() for scene in scenes]
@@ -123,14 +125,6 @@ def similarity_metrics(scenes: Sequence[SceneSimilarities], threshold: float = 0
         alpha=hota.array_labels,
         hota_at=h["HOTA"],
     )
-
-
-def _trackeval_metrics() -> Any:
-    try:
-        from trackeval import metrics
-    except ImportError as error:
-        raise MissingExtraError("HOTA needs trackeval: pip install 'saga-fg[eval]'") from error
-    return metrics
 
 
 def _numbered(names: Sequence[IntArray | StrArray]) -> list[IntArray]:

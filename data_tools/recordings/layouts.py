@@ -37,7 +37,7 @@ from data_tools.sensor_logs import kitti_sensor_log
 from data_tools.trajectories import read_kitti_poses, read_tum_poses
 from saga_fg import InputError
 from saga_fg.errors import error_context, unknown_name
-from saga_fg.numerics import FloatArray, inverse_transform, quaternion_rotation
+from saga_fg.numerics import FloatArray, inverse_transform, quaternion_rotation, rigid_transforms
 from saga_fg.parts import find
 from saga_fg.providers.vehicle_sensors import mounting
 from saga_fg.tables import seconds_of_dates
@@ -333,9 +333,8 @@ def mulran(source: Path, options: RecordingOptions) -> ScanRecording:
     times, poses = _times_of_names(files, options.period), None
     if (table := source / "global_pose.csv").is_file():
         numbers = read_rows(table, (13,), "time, r11, ..., tz", ",").numbers(slice(0, 13), ("pose",) * 13, np.inf)
-        every = np.tile(np.eye(4), (len(numbers), 1, 1))
-        every[:, :3] = numbers[:, 1:].reshape(-1, 3, 4)
-        poses = _nearest(numbers[:, 0] * 1e-9, every, times)
+        every = numbers[:, 1:].reshape(-1, 3, 4)
+        poses = _nearest(numbers[:, 0] * 1e-9, rigid_transforms(every[:, :, :3], every[:, :, 3]), times)
     ego_T_lidar = mounting("calib", (1.7042, -0.021, 1.8047, *np.radians([0.0001, 0.0003, 179.6654]).tolist())).matrix()
     return _of_files("mulran", files, times, _ouster, ego_T_lidar=ego_T_lidar, world_T_ego=poses)
 
@@ -403,10 +402,7 @@ def _poses(rows: FloatArray) -> FloatArray:
     norm = np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
     if (norm < 0.9).any() or (norm > 1.1).any():
         raise InputError(f"pose {int(np.argmax((norm < 0.9) | (norm > 1.1))) + 1}: expected a unit quaternion")
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = quaternion_rotation((rows[:, 3:] / norm)[:, [3, 0, 1, 2]])
-    poses[:, :3, 3] = rows[:, :3]
-    return poses
+    return rigid_transforms(quaternion_rotation((rows[:, 3:] / norm)[:, [3, 0, 1, 2]]), rows[:, :3])
 
 
 def hilti(source: Path, options: RecordingOptions) -> ScanRecording:

@@ -35,7 +35,8 @@ from typing import Any, Literal, Protocol
 
 from data_tools.datasets.source import Part
 from pipelines.tracking import one_thread
-from saga_fg import Dataset, InputError, MissingExtraError, SagaError
+from saga_fg import Dataset, InputError, SagaError
+from saga_fg.errors import require_extra
 from saga_fg.kernels.compilation import load_kernels
 
 Status = Literal["done", "unchanged", "failed"]
@@ -47,11 +48,9 @@ class SceneTask(Protocol):
     @property
     def configuration(self) -> str:
         """YAML text of everything, besides the input, that the results depend on."""
-        ...
 
     def run(self, name: str, dataset: Dataset, folder: Path) -> Mapping[str, int]:
         """Write the results of input `name` to files in an empty folder; returns counts for people to read."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,10 +292,9 @@ def _connected(address: str, workers: int) -> ModuleType:
     """Ray, connected to a cluster."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # what Ray is about to do, and warns of
-    try:
-        import ray
-    except ImportError as error:
-        raise MissingExtraError('--ray: Ray is not installed; pip install "saga-fg[ray]"') from error
+    require_extra("ray", "--ray", "ray")
+    import ray
+
     local: dict[str, Any] = {}
     if address == "local":
         local = {"num_cpus": workers or None, "include_dashboard": False}

@@ -257,7 +257,6 @@ class Pool(Protocol):
 
     def outcomes(self, jobs: Iterator[Job], total: int) -> Iterator[Outcome]:
         """Yield the outcomes of all jobs as they come."""
-        ...
 
 
 @dataclass

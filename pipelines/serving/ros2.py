@@ -26,7 +26,7 @@ import numpy as np
 from data_tools.datasets.mcap.dataset import RecordingOptions, message_content, placed_frames
 from data_tools.datasets.mcap.objects import OBJECT_TYPES, RESULTS, MessageObjects, message_objects
 from data_tools.datasets.mcap.recording import LoggedMessage
-from data_tools.datasets.mcap.ros2_types import decoder, encoded, plain_type
+from data_tools.datasets.mcap.ros2_types import decoder, encoded
 from data_tools.datasets.mcap.transforms import HOLD, ODOMETRY_TYPES, WORLD, TransformBuffer, find_places
 from data_tools.files import one_line
 from pipelines.serving.messages import FrameMessage

@@ -203,11 +203,9 @@ class StateSaver(Protocol):
 
     def save(self) -> bool:
         """Write the state; return True if it is on the disk now."""
-        ...
 
     def status(self) -> dict[str, Any]:
         """Return the age of the file and the latest error."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

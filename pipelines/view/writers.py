@@ -15,6 +15,7 @@ Paths are rerun's entities, frames its transforms; times are on the timelines `t
 """
 
 from collections.abc import Iterable, Sequence
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any, assert_never
@@ -23,7 +24,7 @@ import numpy as np
 
 from data_tools.files import atomic_file, check_writable
 from pipelines.view.scenes import Arrows, Drawing, Lines, Points, Pose, Shape, Solids
-from saga_fg.errors import InputError, MissingExtraError
+from saga_fg.errors import InputError, require_extra
 from saga_fg.numerics import FloatArray, IntArray, rotation_quaternion, yaw_quaternion
 
 OPACITY = 0.4  # of solids
@@ -38,11 +39,9 @@ IDENTITY: Fields = {"position": {}, "orientation": {"w": 1.0}}
 
 def load_mcap() -> Any:
     """The class that writes messages. Raises `MissingExtraError` where its packages are not installed."""
-    try:
-        import foxglove_schemas_protobuf  # noqa: F401
-        from mcap_protobuf.writer import Writer
-    except ImportError as error:
-        raise MissingExtraError('files for Foxglove need mcap; pip install "saga-fg[mcap]"') from error
+    require_extra("mcap", "a file for Foxglove", "mcap", "mcap_protobuf", "foxglove_schemas_protobuf")
+    from mcap_protobuf.writer import Writer
+
     return Writer
 
 
@@ -182,12 +181,8 @@ APPLICATION = "saga-fg"
 
 def load_rerun() -> ModuleType:
     """The package rerun. Raises `MissingExtraError` where it is not installed."""
-    try:
-        import rerun
-    except ImportError as error:
-        raise MissingExtraError('the 3D view needs rerun; pip install "saga-fg[view]"') from error
-    module: ModuleType = rerun
-    return module
+    require_extra("view", "the 3D view", "rerun")
+    return import_module("rerun")
 
 
 def write_rerun(path: Path, name: str, roots: Sequence[str], drawings: Iterable[Drawing]) -> None:

@@ -63,6 +63,13 @@ def inverse_transform(target_T_source: FloatArray) -> FloatArray:
     return result
 
 
+def rigid_transforms(rotation: FloatArray, translation: FloatArray) -> FloatArray:
+    """Transforms (N, 4, 4) of rotations (N, 3, 3) and translations (N, 3)."""
+    transforms = np.tile(np.eye(4), (len(translation), 1, 1))
+    transforms[:, :3, :3], transforms[:, :3, 3] = rotation, translation
+    return transforms
+
+
 def transform_points(target_T_source: FloatArray, points: FloatArray) -> FloatArray:
     """Points (N, 3) in source coordinates to target coordinates."""
     return points @ target_T_source[:3, :3].T + target_T_source[:3, 3]

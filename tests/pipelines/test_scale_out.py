@@ -386,7 +386,7 @@ def test_without_ray_the_extra_is_named(tmp_path, monkeypatch):
     write_recordings(tmp_path / "in", 1)
     monkeypatch.setitem(sys.modules, "ray", None)
     said = refused("track", "file", tmp_path / "in" / "a00.csv", "--ray", "local", "-o", tmp_path / "out")
-    assert said == 'error: --ray: Ray is not installed; pip install "saga-fg[ray]"\n'
+    assert said == "error: --ray needs ray: pip install 'saga-fg[ray]'\n"
 
 
 def test_edge_rules_that_meet_no_class_are_told_once_however_it_runs(tmp_path, caplog):

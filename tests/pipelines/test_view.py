@@ -180,9 +180,9 @@ def test_broken_slam_results_are_refused(tmp_path):
 
 def test_missing_extras_are_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    assert 'pip install "saga-fg[view]"' in refused("view", "file", tmp_path / "t.csv", "--save", tmp_path / "t.rrd")
-    monkeypatch.setitem(sys.modules, "mcap_protobuf.writer", None)
-    assert 'pip install "saga-fg[mcap]"' in refused("view", "file", "tracks.csv", "--save", tmp_path / "t.mcap")
+    assert "pip install 'saga-fg[view]'" in refused("view", "file", tmp_path / "t.csv", "--save", tmp_path / "t.rrd")
+    monkeypatch.setitem(sys.modules, "mcap_protobuf", None)
+    assert "pip install 'saga-fg[mcap]'" in refused("view", "file", "tracks.csv", "--save", tmp_path / "t.mcap")
     assert not list(tmp_path.iterdir())
 
 

@@ -50,6 +50,7 @@ from saga_fg.numerics import (
     checked_quaternions,
     quaternion_rotation,
     refuse,
+    rigid_transforms,
     yaw_of,
 )
 from saga_fg.tables import DetectionTable
@@ -160,10 +161,8 @@ def boxes_of(rows: Mapping[str, Any], frame_T_box: FloatArray) -> Boxes:
 def transforms(rows: dict[str, Any]) -> FloatArray:
     """(N, 4, 4) of the pose columns."""
     quaternion, translation = (np.stack([rows[name] for name in names], axis=1) for names in (POSE[:4], POSE[4:]))
-    T = np.tile(np.eye(4), (len(quaternion), 1, 1))
-    T[:, :3, :3] = quaternion_rotation(checked_quaternions("qw qx qy qz", quaternion))
-    T[:, :3, 3] = checked("tx_m ty_m tz_m", translation, (len(T), 3))
-    return T
+    rotation = quaternion_rotation(checked_quaternions("qw qx qy qz", quaternion))
+    return rigid_transforms(rotation, checked("tx_m ty_m tz_m", translation, (len(rotation), 3)))
 
 
 BORDERS = ("left_lane_boundary", "right_lane_boundary")

@@ -40,7 +40,15 @@ from data_tools.datasets.argoverse2.logs import (
 )
 from data_tools.datasets.detection_files import TrackRows, read_detections
 from data_tools.datasets.results import Results, scene_result
-from data_tools.datasets.source import ChosenScenes, DatasetSource, ResultFormat, Surroundings, TrackedScenes, option
+from data_tools.datasets.source import (
+    ChosenScenes,
+    DatasetSource,
+    ResultFormat,
+    Surroundings,
+    TrackedScenes,
+    option,
+    require_measured,
+)
 from data_tools.files import arrow_arrays, atomic_file, is_url, local_copy, local_tree
 from saga_fg.errors import InputError, error_context
 from saga_fg.numerics import (
@@ -49,10 +57,11 @@ from saga_fg.numerics import (
     StrArray,
     inverse_transform,
     quaternion_rotation,
+    rigid_transforms,
     rotation_quaternion,
     yaw_quaternion,
 )
-from saga_fg.types import Boxes, Dataset, Scene, Tracks, known_velocities
+from saga_fg.types import Dataset, Scene, Tracks, known_velocities
 
 SCORED = (
     *("ARTICULATED_BUS", "BICYCLE", "BICYCLIST", "BOLLARD", "BOX_TRUCK", "BUS", "CONSTRUCTION_BARREL"),
@@ -161,24 +170,18 @@ def track_categories(scene: Scene, moments: Sequence[Tracks]) -> dict[int, str]:
 def _columns(scene: Scene, moments: Sequence[Tracks]) -> dict[str, Any]:
     """The columns of `COLUMNS` of a log, in the frame of the vehicle."""
     category_of, counts = track_categories(scene, moments), [len(tracks) for tracks in moments]
-    moment = np.repeat(np.arange(len(scene)), counts)
-    boxes = Boxes.concatenate([tracks.boxes for tracks in moments])
-    id_ = np.concatenate([np.empty(0, dtype=np.int64), *(tracks.id for tracks in moments)])
-    if not np.isfinite(boxes.yaw).all() or not np.isfinite(boxes.size).all():
-        raise InputError(f"log {scene.name}: expected tracks with sizes and headings, some have none")
-    world_T_box = np.tile(np.eye(4), (len(boxes), 1, 1))
-    world_T_box[:, :3, :3] = quaternion_rotation(yaw_quaternion(boxes.yaw))
-    world_T_box[:, :3, 3] = boxes.position
+    moment, tracks = np.repeat(np.arange(len(scene)), counts), Tracks.concatenate([Tracks.empty(0.0), *moments])
+    require_measured(tracks, f"log {scene.name}")
+    boxes, velocity = tracks.boxes, known_velocities(tracks.boxes.velocity, tracks.velocity_covariance)
+    world_T_box = rigid_transforms(quaternion_rotation(yaw_quaternion(boxes.yaw)), boxes.position)
     ego_T_box = inverse_transform(scene.world_T_ego[moment]) @ world_T_box
-    spread = np.concatenate([np.empty((0, 2, 2)), *(tracks.velocity_covariance for tracks in moments)])
-    velocity = known_velocities(boxes.velocity, spread)
     columns = {
         "log_id": [scene.name] * len(boxes),
         "timestamp_ns": np.array(scene.tokens, dtype=np.int64)[moment],
-        "track_id": id_,
-        "score": np.concatenate([np.empty(0), *(tracks.score for tracks in moments)]),
+        "track_id": tracks.id,
+        "score": tracks.score,
         **dict(zip(_VELOCITY, velocity.T, strict=True)),
-        "category": [category_of[each] for each in id_.tolist()],
+        "category": [category_of[each] for each in tracks.id.tolist()],
         **dict(zip(SIZE, boxes.size.T, strict=True)),
         **dict(zip(POSE[4:], ego_T_box[:, :3, 3].T, strict=True)),
     }

@@ -34,7 +34,7 @@ import numpy as np
 
 from data_tools.datasets.detection_files.formats import Layout, read_raw_table
 from data_tools.files import atomic_file, open_bytes
-from saga_fg.errors import InputError, MissingExtraError, error_context
+from saga_fg.errors import InputError, error_context, require_extra
 from saga_fg.numerics import (
     Columns,
     FloatArray,
@@ -147,11 +147,10 @@ def write_rows(path: str | Path, columns: tuple[str, ...], rows: Iterable[list[A
 
 def _write_parquet(path: str | Path, columns: tuple[str, ...], rows: Iterator[list[Any]]) -> None:
     """Write rows as they come: `TEXTS` as text, `WHOLE` as whole numbers, all other columns as numbers."""
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ImportError as error:
-        raise MissingExtraError(f"{path}: Parquet needs pyarrow: pip install 'saga-fg[parquet]'") from error
+    require_extra("parquet", f"{path}: Parquet", "pyarrow")
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     kinds = dict.fromkeys(TEXTS, pa.string()) | dict.fromkeys(WHOLE, pa.int64())
     schema = pa.schema([(name, kinds.get(name, pa.float64())) for name in columns])
     with atomic_file(path) as file, pq.ParquetWriter(file, schema) as writer:

@@ -57,7 +57,7 @@ from data_tools.lidar import KITTI, Scan, ScanRecording, azimuth_times, read_rec
 from data_tools.metrics.kitti_boxes import KittiObjects, camera_boxes_to_world, has_box
 from data_tools.trajectories import central_differences
 from saga_fg.errors import InputError, error_context, unknown_name
-from saga_fg.numerics import FloatArray, inverse_transform, is_rotation, refuse
+from saga_fg.numerics import FloatArray, inverse_transform, is_rotation, refuse, rigid_transforms
 from saga_fg.types import Annotations, Detections, Frame, Scene
 
 _KEYS: dict[str, tuple[tuple[int, int], tuple[str, ...]]] = {
@@ -155,10 +155,8 @@ def read_poses(path: str | Path) -> FloatArray:
     expected = "expected degrees within {} of 0, got {:g}"
     refuse(np.abs(latitude) > 85, lambda row: table.fault(row, f"latitude: {expected.format(85, latitude[row])}"))
     refuse(np.abs(longitude) > 180, lambda row: table.fault(row, f"longitude: {expected.format(180, longitude[row])}"))
-    poses = np.tile(np.eye(4), (len(table), 1, 1))
-    poses[:, :3, :3] = _turn(yaw, 0, 1) @ _turn(pitch, 2, 0) @ _turn(roll, 1, 2)
-    poses[:, :3, 3] = world_position(latitude, longitude, altitude, np.array([latitude[0], longitude[0], altitude[0]]))
-    return poses
+    position = world_position(latitude, longitude, altitude, np.array([latitude[0], longitude[0], altitude[0]]))
+    return rigid_transforms(_turn(yaw, 0, 1) @ _turn(pitch, 2, 0) @ _turn(roll, 1, 2), position)
 
 
 def world_position(latitude: FloatArray, longitude: FloatArray, altitude: FloatArray, origin: FloatArray) -> FloatArray:

@@ -105,7 +105,7 @@ def write_kitti_results(
     writable, tracks that do not fit the scene, a size or heading that is unknown, a class KITTI does not have.
     """
     with atomic_directory(directory) as folder:
-        write_tracks(folder / table, _written(folder, dataset, scenes))
+        write_tracks(folder / table, _written(directory, folder, dataset, scenes))
 
 
 def write_kitti_labels(
@@ -117,16 +117,16 @@ def write_kitti_labels(
     or heading that is unknown, a class KITTI does not have.
     """
     with atomic_directory(directory) as folder:
-        for _ in _written(folder, dataset, tracks_of(scenes), with_score=False):
+        for _ in _written(directory, folder, dataset, tracks_of(scenes), with_score=False):
             pass
 
 
 def _written(
-    folder: Path, dataset: KittiTracking, scenes: TrackedScenes, with_score: bool = True
+    directory: str | Path, folder: Path, dataset: KittiTracking, scenes: TrackedScenes, with_score: bool = True
 ) -> Iterator[tuple[Scene, Sequence[Tracks]]]:
-    """Write the text of each sequence, and pass it on."""
+    """Write the text of each sequence to the folder that becomes the directory, and pass it on."""
     for scene, moments in scenes:
-        with error_context(f"sequence {scene.name}"):
+        with error_context(f"{directory}: sequence {scene.name}"):
             text = kitti_result_text(scene, moments, dataset.calibration(scene.name), with_score)
         (folder / f"{scene.name}.txt").write_text(text, encoding="utf-8")
         yield scene, moments

@@ -373,6 +373,7 @@ def _marker_message(tracks: Tracks, stamp: int, frame: str, names: Mapping[str, 
     texture = ros_message("sensor_msgs/CompressedImage", header(0, ""), "", nothing)
     mesh = ros_message("visualization_msgs/MeshFile", "", nothing)
     markers = []
+    look: tuple[Any, ...]
     for *about, opacity, text in columns:
         look = ros_message("std_msgs/ColorRGBA", *_COLOUR, opacity), lifetime, False, [], [], "", texture, []
         markers.append(ros_message("visualization_msgs/Marker", head, *about, *look, text, "", mesh, False))

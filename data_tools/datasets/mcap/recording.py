@@ -10,14 +10,13 @@ import sqlite3
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
 from io import SEEK_END
 from pathlib import Path
 from typing import Any
 
 from data_tools.datasets.mcap.ros2_types import decoder, definition, plain_type
 from data_tools.files import isolated, one_line, open_bytes
-from saga_fg.errors import InputError, MissingExtraError, unknown_name
+from saga_fg.errors import InputError, require_extra, unknown_name
 
 SUFFIXES = (".mcap", ".db3")
 _NO_BAG = "expected a bag of ROS 2 in SQLite"
@@ -52,8 +51,7 @@ class Recording:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        if find_spec("mcap") is None or find_spec("rosbags") is None:
-            raise MissingExtraError("recordings of ROS 2 need mcap and rosbags: pip install 'saga-fg[mcap]'")
+        require_extra("mcap", "a recording of ROS 2", "mcap", "rosbags")
         self.files = _files(self.path)
         self.topics: dict[str, Topic] = {}
         for file in self.files:

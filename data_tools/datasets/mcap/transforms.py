@@ -28,6 +28,7 @@ from saga_fg.numerics import (
     checked_quaternions,
     inverse_transform,
     quaternion_rotation,
+    rigid_transforms,
 )
 
 TRANSFORM_TYPES = ("tf2_msgs/TFMessage",)
@@ -64,7 +65,7 @@ class _Edge:
 
     def at(self, time: IntArray, hold: float) -> tuple[FloatArray, BoolArray]:
         """(N, 4, 4) at some times, ns, and where they are known; hold: s beyond the ends."""
-        n, last = len(time), len(self.time) - 1
+        last = len(self.time) - 1
         after = np.clip(np.searchsorted(self.time, time), 1, max(last, 1))
         after, before = np.minimum(after, last), np.minimum(after - 1, last)
         span = self.time[after] - self.time[before]
@@ -72,11 +73,10 @@ class _Edge:
         a, b = self.rotation[before], self.rotation[after]
         b = np.where((a * b).sum(axis=1, keepdims=True) < 0, -b, b)
         quaternion = (1 - share) * a + share * b
-        T = np.tile(np.eye(4), (n, 1, 1))
-        T[:, :3, :3] = quaternion_rotation(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))
-        T[:, :3, 3] = (1 - share) * self.translation[before] + share * self.translation[after]
+        rotation = quaternion_rotation(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))
+        T = rigid_transforms(rotation, (1 - share) * self.translation[before] + share * self.translation[after])
         if self.static:
-            return T, np.ones(n, dtype=bool)
+            return T, np.ones(len(time), dtype=bool)
         beyond = np.maximum(self.time[0] - time, time - self.time[-1]) > hold * 1e9
         inside = (time > self.time[before]) & (time < self.time[after])
         return T, ~beyond & ~(inside & (span > LONGEST_GAP * 1e9))

@@ -37,6 +37,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from data_tools.datasets.nuscenes.tables import DETECTION_CLASSES, TRACKING_CLASSES
+from data_tools.datasets.source import require_measured
 from data_tools.files import JsonStream, atomic_file, open_json
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import (
@@ -300,10 +301,7 @@ def _boxes(scene: str, token: str, tracks: Tracks, class_of: dict[int, str]) -> 
     for id_, label in zip(chosen.id.tolist(), boxes.label.tolist(), strict=True):
         first = class_of.setdefault(id_, label) == label
         names.append(f"{scene}-{id_}" if first else f"{scene}-{id_}-{label}")
-    unmeasured = ~np.isfinite(boxes.size).all(axis=1) | ~np.isfinite(boxes.yaw)
-    if unmeasured.any():
-        id_ = int(chosen.id[np.argmax(unmeasured)])
-        raise InputError(f"sample {token}: track {id_}: expected a known size and heading, the format requires them")
+    require_measured(chosen, f"sample {token}")
     columns = zip(
         boxes.position.round(6).tolist(),
         boxes.size[:, [1, 0, 2]].round(6).tolist(),
