@@ -124,7 +124,7 @@ def track_scene(
             wanted.append(latest if latest is not None and latest.timestamp == moment else tracker.tracks(moment))
             if horizons is not None and latest is not None:
                 predicted += _predicted(tracker, moment, horizons, latest.timestamp)
-    clocks, noise = compared_clocks(tracker), tracker.noise_scales
+    clocks, noise = compared_clocks(tracker), {name: one.scale for name, one in tracker.sensor_noise.items()}
     return TrackedScene(scene, tuple(wanted), tuple(milliseconds), tuple(predicted), clocks, noise)
 
 

@@ -124,7 +124,7 @@ class Summary:
         for name, scales in self.noise.items():
             typer.echo(
                 f"noise of {name}: {np.median(scales):.2g} of what its model says, by its successive detections; "
-                "ellipses are scaled (sensors.*.calibrate_noise: false leaves them)"
+                "ellipses are scaled, by class and range (sensors.*.calibrate_noise: false leaves them)"
             )
 
 

@@ -168,7 +168,8 @@ class Sensor(Settings):
         lambda: {DEFAULT: NoiseModel()}, "measurement noise by class; the entry named default serves all others"
     )
     calibrate_noise: bool = setting(
-        False, "true: scale the noise of positions by what successive detections say of it, from 1/3 to 10/3"
+        False,
+        "true: scale the noise of positions, by class and range, by what successive detections say, from 1/3 to 10/3",
     )
     use_velocity: bool = setting(True, "use velocities and range rates, where they are measured")
     detection_probability: Fraction = setting(

@@ -274,7 +274,7 @@ class LabelBuilder:
     def _smooth(self, until: float) -> None:
         """All chunks that are complete, with their margins, before a time; infinite: all that is left."""
         model = self._model
-        sensors = scaled_sensors(model.sensors, self._tracker.noise_scales)
+        sensors = scaled_sensors(model.sensors, self._tracker.sensor_noise)
         for begin, end in self._backlog.chunks(until):
             tracked, wanted = self._backlog.around(begin, end)
             frames = [each.frame for each in tracked]

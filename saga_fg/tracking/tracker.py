@@ -31,7 +31,7 @@ from saga_fg.tracking.clock import TimeVerdict
 from saga_fg.tracking.clock_offsets import SensorTime, compared, sensor_times
 from saga_fg.tracking.journal import Observer, Stage, TrackerView
 from saga_fg.tracking.map_nodes import MapNodes
-from saga_fg.tracking.measurements import UNMEASURED, for_gates, frame_measurements, observed, with_scale
+from saga_fg.tracking.measurements import UNMEASURED, SensorNoise, for_gates, frame_measurements, observed, with_scale
 from saga_fg.tracking.prediction import judge_edges, look_ahead, predict
 from saga_fg.tracking.relinking import hand_over
 from saga_fg.tracking.settings import TrackerSettings
@@ -307,9 +307,9 @@ class Tracker:
         return sensor_times(self._state.clock, self._state.shared)
 
     @property
-    def noise_scales(self) -> dict[str, float]:
-        """The factors on the deviations of the models of sensors with `calibrate_noise`, once known."""
-        return {name: noise.scale for name, noise in self._state.noise.items() if noise.seen}
+    def sensor_noise(self) -> dict[str, SensorNoise]:
+        """The noise of sensors with `calibrate_noise`, by name, as far as their detections tell it."""
+        return {name: noise for name, noise in self._state.noise.items() if noise.seen}
 
     @property
     def late_frames(self) -> int:

@@ -68,7 +68,7 @@ class Recorder:
         self.seen: list[float] = []
         self.predicted: list[float] = []
         self.sensor_times: dict[str, Any] = {}
-        self.noise_scales: dict[str, float] = {}
+        self.sensor_noise: dict[str, Any] = {}
 
     def step(self, frame: Frame) -> Tracks:
         self.seen.append(frame.timestamp)

@@ -10,6 +10,12 @@ MODEL = 0.3  # m
 TABLE = {"default": Sensor(calibrate_noise=True)}
 
 
+def taken(noise, time, position, label="car", distance=0.0):
+    n = len(position)
+    R = np.tile(MODEL**2 * np.eye(2), (n, 1, 1))
+    return noise.observed(time, np.arange(n), position, R, np.resize(label, n), np.resize(distance, n))
+
+
 def seen(sigma, motion, rng, frames=60, objects=8, jitter=0.0):
     """The noise after frames of objects that move by `motion(t)` (2,), with white errors."""
     noise, time = SensorNoise(), 0.0
@@ -17,7 +23,7 @@ def seen(sigma, motion, rng, frames=60, objects=8, jitter=0.0):
     for _ in range(frames):
         time += 0.1 + rng.uniform(-jitter, jitter)
         position = start + motion(time) + rng.normal(0, sigma, (objects, 2))
-        noise = noise.observed(time, np.arange(objects), position, np.tile(MODEL**2 * np.eye(2), (objects, 1, 1)))
+        noise = taken(noise, time, position)
     return noise
 
 
@@ -41,12 +47,26 @@ def test_the_scale_stays_within_bounds_and_waits_for_evidence():
 
 
 def test_the_scale_stays_after_the_first_seconds():
-    rng, R = np.random.default_rng(3), np.tile(MODEL**2 * np.eye(2), (8, 1, 1))
+    rng = np.random.default_rng(3)
     noise = seen(0.15, lambda t: np.zeros(2), rng, frames=120)
-    later = noise.observed(60.0, np.arange(8), rng.normal(0, 9, (8, 2)), R)
+    later = taken(noise, 60.0, rng.normal(0, 9, (8, 2)))
     assert noise.settled
     assert later.scale == noise.scale == pytest.approx(0.5, rel=0.2)
     assert later.seen == noise.seen > 0
+
+
+def test_noise_is_found_by_class_and_range():
+    rng, noise = np.random.default_rng(4), SensorNoise()
+    label, distance = np.repeat(["bus", "car", "car", "car"], 6), np.repeat([15.0, 12.0, 30.0, 55.0], 6)
+    sigma = np.where(label == "bus", 0.6, np.hypot(0.15, 0.01 * distance))
+    start = rng.uniform(-50, 50, (len(label), 2))
+    for k in range(95):
+        noise = taken(noise, 0.1 * k, start + 0.8 * k + rng.normal(0, sigma[:, None], start.shape), label, distance)
+    found = noise.scales(label, distance)
+    np.testing.assert_allclose(found, sigma / MODEL, rtol=0.25)
+    rare = noise.scales(np.array(["van"]), np.array([40.0]))
+    assert rare == pytest.approx([noise.scale])
+    assert found.min() < noise.scale < found.max()
 
 
 def frames(sigma, count=80, seed=0, **columns):
@@ -73,7 +93,7 @@ def test_ellipses_of_a_table_hold_what_they_say(sigma):
             d2 = np.einsum("ni,nij,nj->n", error, np.linalg.inv(tracks.position_covariance), error)
             held += (d2 < 4.605).tolist()
     assert 0.82 < np.mean(held) < 0.97
-    assert tracker.noise_scales["table"] == pytest.approx(sigma / MODEL, rel=0.25)
+    assert tracker.sensor_noise["table"].scale == pytest.approx(sigma / MODEL, rel=0.25)
 
 
 def test_noise_that_comes_with_the_detections_stays_as_it_is():
@@ -82,10 +102,16 @@ def test_noise_that_comes_with_the_detections_stays_as_it_is():
     for frame, _ in frames(1.0, position_covariance=given):
         a, b = with_scale.step(frame), without.step(frame)
         np.testing.assert_array_equal(a.position_covariance, b.position_covariance)
-    assert with_scale.noise_scales == {}
+    assert with_scale.sensor_noise == {}
 
 
 def test_models_are_scaled_in_positions_alone():
-    scaled = scaled_sensors({}, {"table": 2.0})["table"].noise["default"]
+    noise = SensorNoise(2.0, {"car": (1.5, 0.1)})
+    scaled = scaled_sensors({}, {"table": noise})["table"]
     usual = Sensor().noise["default"]
-    assert (scaled.position, scaled.velocity, scaled.yaw) == (2 * usual.position, usual.velocity, usual.yaw)
+    others = scaled.noise["default"]
+    assert (others.position, others.velocity, others.yaw) == (2 * usual.position, usual.velocity, usual.yaw)
+    at = np.array([[0.0, 0.0], [3.0, 4.0]])
+    R = scaled.position_covariance(np.array(["car", "car"]), at, np.ones(2), np.zeros(2))
+    s = noise.scales(np.array(["car", "car"]), np.array([0.0, 5.0]))
+    np.testing.assert_allclose(R, (s * usual.position)[:, None, None] ** 2 * np.eye(2), atol=1e-12)
