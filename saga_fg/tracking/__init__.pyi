@@ -6,7 +6,8 @@ from .greedy import GreedySettings, GreedyTracker
 from .joint_state import JointTrackState
 from .journal import Event, Journal, Observer, Stage, TrackerView, of_scene
 from .map_nodes import motion_of
-from .measurements import frame_measurements, scaled_sensors
+from .measurements import frame_measurements
+from .sensor_noise import scaled_sensors
 from .settings import (
     AssociationCost,
     AssociationName,

@@ -18,7 +18,7 @@ from saga_fg.numerics import Columns, FloatArray, IntArray, StrArray, near_pairs
 from saga_fg.settings import PositiveOrInf, Settings, setting, settings_group
 from saga_fg.tracking.clock import MAX_JUMP, Clock, TimeVerdict
 from saga_fg.tracking.clock_offsets import SensorTime, SharedObservations, sensor_times
-from saga_fg.tracking.measurements import SensorNoise
+from saga_fg.tracking.sensor_noise import SensorNoise
 from saga_fg.types import DEFAULT, MAX_POSITION, MAX_SPEED, Boxes, Frame, Tracks, class_numbers
 
 MAX_DELAY = 0.5  # s; older frames are left out

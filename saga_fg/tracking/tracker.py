@@ -31,9 +31,10 @@ from saga_fg.tracking.clock import TimeVerdict
 from saga_fg.tracking.clock_offsets import SensorTime, compared, sensor_times
 from saga_fg.tracking.journal import Observer, Stage, TrackerView
 from saga_fg.tracking.map_nodes import MapNodes
-from saga_fg.tracking.measurements import UNMEASURED, SensorNoise, for_gates, frame_measurements, observed, with_scale
+from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.tracking.prediction import judge_edges, look_ahead, predict
 from saga_fg.tracking.relinking import hand_over
+from saga_fg.tracking.sensor_noise import UNMEASURED, SensorNoise, for_gates, observed, with_scale
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.track_life import delete_tracks, initiate_tracks, report_tracks, resolve_tracks
 from saga_fg.tracking.tracker_state import TrackerSnapshot, TrackerState

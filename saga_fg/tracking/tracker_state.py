@@ -32,8 +32,9 @@ from saga_fg.tracking.edge_record import EdgeRecord, HaltingPlaces
 from saga_fg.tracking.identities import Encounters, GivenIdentities, exchanged
 from saga_fg.tracking.joint_state import JointTrackState, moved_to_present, past_position
 from saga_fg.tracking.map_nodes import MapNodes, classes_read, motion_of
-from saga_fg.tracking.measurements import EgoNode, SensorNoise
+from saga_fg.tracking.measurements import EgoNode
 from saga_fg.tracking.right_of_way import RightOfWay
+from saga_fg.tracking.sensor_noise import SensorNoise
 from saga_fg.tracking.settings import AssociationCost, ClassSettings, TrackerSettings
 from saga_fg.tracking.track_filters import Kinematics
 from saga_fg.tracking.track_table import TrackTable

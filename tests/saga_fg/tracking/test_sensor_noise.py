@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from saga_fg import Boxes, Detections, Frame, Sensor, Tracker, TrackerSettings
-from saga_fg.tracking.measurements import LEAST, MOST, SensorNoise, scaled_sensors
+from saga_fg.tracking.sensor_noise import LEAST, MOST, SensorNoise, scaled_sensors
 
 MODEL = 0.3  # m
 TABLE = {"default": Sensor(calibrate_noise=True)}
