@@ -33,15 +33,10 @@ from pipelines.serving.messages import FrameMessage
 from pipelines.serving.ros2_network import Ros2Network
 from pipelines.serving.server import StopRequest
 from pipelines.serving.stream import StreamTracker
-from saga_fg.errors import InputError, error_context
+from saga_fg.errors import InputError, error_context, require_extra
 from saga_fg.types import Frame, Tracks
 
-try:
-    import rosbags  # noqa: F401
-except ImportError as error:
-    from saga_fg.errors import MissingExtraError
-
-    raise MissingExtraError("messages of ROS 2 need rosbags: pip install 'saga-fg[ros2]'") from error
+require_extra("ros2", "a node of ROS 2", "rosbags")
 
 log = logging.getLogger(__name__)
 

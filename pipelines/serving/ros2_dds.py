@@ -16,7 +16,7 @@ from typing import Any
 from data_tools.datasets.mcap.recording import LoggedMessage
 from data_tools.datasets.mcap.ros2_types import fields_of, plain_type
 from pipelines.serving.ros2_network import DEPTH, PUBLISHED_DEPTH, TRANSIENT, Ros2Network
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, MissingExtraError
 
 try:
     from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
@@ -27,8 +27,6 @@ try:
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic as DdsTopic
 except ImportError as error:
-    from saga_fg.errors import MissingExtraError
-
     raise MissingExtraError("DDS needs cyclonedds: pip install 'saga-fg[ros2]'") from error
 
 BLOCKING = 100_000_000  # ns that a full reliable writer waits

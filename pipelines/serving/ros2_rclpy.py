@@ -14,7 +14,7 @@ from typing import Any
 
 from data_tools.datasets.mcap.recording import LoggedMessage
 from pipelines.serving.ros2_network import DEPTH, PUBLISHED_DEPTH, TRANSIENT, Ros2Network
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, MissingExtraError
 
 try:
     import rclpy
@@ -23,8 +23,6 @@ try:
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
     from rosidl_runtime_py.utilities import get_message
 except ImportError as error:
-    from saga_fg.errors import MissingExtraError
-
     raise MissingExtraError(
         "rclpy comes with ROS 2: source its setup.bash first, or --middleware cyclonedds"
     ) from error

@@ -10,7 +10,7 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.errors import InputError, MissingExtraError
+from saga_fg.errors import InputError, require_extra
 from saga_fg.numerics import (
     BoolArray,
     Columns,
@@ -72,10 +72,9 @@ class ShownTable:
 
 def data_frame(columns: Mapping[str, Any]) -> Any:
     """Return columns as a `pandas.DataFrame`. Raises `MissingExtraError` without pandas."""
-    try:
-        import pandas
-    except ImportError as error:
-        raise MissingExtraError("tables need pandas: pip install 'saga-fg[pandas]'") from error
+    require_extra("pandas", "tables", "pandas")
+    import pandas
+
     return pandas.DataFrame(columns)
 
 
