@@ -1,6 +1,16 @@
 """Planar laser scans: logs, registration with lines, search in a window, occupancy."""
 
-from data_tools.laser.carmen import LaserLog, read_carmen
+from data_tools.laser.carmen import LaserLog, check_wheels, read_carmen, warn_of_times, without_jumps
 from data_tools.laser.mapping import LineMap, OccupancyGrid, ScoreGrid, thinned
 
-__all__ = ["LaserLog", "LineMap", "OccupancyGrid", "ScoreGrid", "read_carmen", "thinned"]
+__all__ = [
+    "LaserLog",
+    "LineMap",
+    "OccupancyGrid",
+    "ScoreGrid",
+    "check_wheels",
+    "read_carmen",
+    "thinned",
+    "warn_of_times",
+    "without_jumps",
+]

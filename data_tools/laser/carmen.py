@@ -27,7 +27,7 @@ import numpy as np
 
 from data_tools.files import isolated, read_text
 from saga_fg.errors import InputError
-from saga_fg.numerics import FloatArray
+from saga_fg.numerics import FloatArray, transforms, vectors
 
 _RECORDS = ("FLASER", "ROBOTLASER1")
 _UNPACK: dict[str, Callable[..., Any]] = {".bz2": bz2.open, ".gz": gzip.open}
@@ -86,9 +86,7 @@ def read_carmen(path: str | Path) -> LaserLog:
     a record with a wrong number of values, or a number that is none or too large.
     """
     file = Path(path)
-    ranges, angles, rest, largest = list[FloatArray](), list[FloatArray](), list[FloatArray](), list[float]()
-    others: set[str] = set()
-    chosen = ""
+    records, others, chosen = list[tuple[FloatArray, FloatArray, FloatArray, float]](), set[str](), ""
     for number, line in enumerate(_lines(file), start=1):
         tag = line[: line.find(" ")]
         if tag not in _RECORDS or (chosen and tag != chosen):  # a log with both says the same twice
@@ -99,16 +97,15 @@ def read_carmen(path: str | Path) -> LaserLog:
         fields = line.split()[1:]
         values, directions, most = _flaser(where, fields) if tag == "FLASER" else _robotlaser(where, fields)
         chosen, readings = tag, len(directions)
-        ranges.append(values[1 : 1 + readings])
-        angles.append(directions)
-        rest.append(np.concatenate([values[:1], values[1 + readings :]]))
-        largest.append(most)
-    if not rest:
+        rest = np.concatenate([values[:1], values[1 + readings :]])  # time and poses
+        records.append((values[1 : 1 + readings], directions, rest, most))
+    if not records:
         there = f"only {', '.join(sorted(others)[:_NAMED])}" if others else "none"
         raise InputError(f"{file}: expected records {' or '.join(_RECORDS)}, there are {there}")
     if ignored := sorted(others & _OTHER_LASERS):
         _log.warning("%s: the readings of %s are left out, %s are taken", file, ", ".join(ignored), chosen)
-    table, measured = np.array(rest), padded(ranges)
+    ranges, angles, rests, largest = zip(*records, strict=True)
+    table, measured = np.array(rests), padded(ranges)
     nothing = 0.999 * _nothing(measured)
     measured = np.where((measured > 0) & (measured < np.minimum(largest, nothing)[:, None]), measured, np.nan)
     laser, robot = table[:, 1:4], table[:, 4:]
@@ -197,3 +194,60 @@ def _unpacked(file: Path) -> Iterator[list[str]]:
     with _UNPACK[file.suffix](file, "rt", encoding="utf-8", errors="replace") as log:
         while lines := log.readlines(_PIECE):
             yield lines
+
+
+_SLACK = 1.0  # m that a step of the wheels may be longer than the largest speed allows: logs come in bursts
+_STILL, _CHANGED, _MANY = 1e-6, 0.3, 0.3  # m of the wheels; m of a reading, and the share of a scan, that show motion
+
+
+def without_jumps(log: LaserLog, largest_speed: float) -> tuple[FloatArray, int]:
+    """Poses (n, 3) of the wheels, where steps faster than `largest_speed` (m/s) count as standing still; their number.
+
+    Steps may be 1 m longer than that speed allows. Warns of the first one.
+    """
+    wheels = transforms(log.odometry)
+    step = np.linalg.inv(wheels[:-1]) @ wheels[1:]
+    way, seconds = np.hypot(step[:, 0, 2], step[:, 1, 2]), np.maximum(np.diff(log.time), 0.0)
+    jumps = np.flatnonzero(way > largest_speed * seconds + _SLACK)
+    if not len(jumps):
+        return log.odometry, 0
+    first = int(jumps[0])
+    _log.warning(
+        "scan %d: the wheels moved %.3g m in %.3g s, more than largest_speed, %g m/s, allows; "
+        "so in %d steps, which count as standing still",
+        first + 2, way[first], seconds[first], largest_speed, len(jumps),
+    )  # fmt: skip
+    for row in jumps.tolist():  # what follows moves by what the jump did
+        wheels[row + 1 :] = wheels[row] @ np.linalg.inv(wheels[row + 1]) @ wheels[row + 1 :]
+    return vectors(wheels), len(jumps)
+
+
+def warn_of_times(time: FloatArray) -> None:
+    """Warns where times (n,), s, run backwards, as those of logs that are written by several processes do, or stay."""
+    same = np.flatnonzero(np.diff(time) == 0)
+    if len(same):
+        _log.warning(
+            "scan %d: its time is that of the scan ahead of it; so for %d of %d scans, "
+            "of which the files have the pose of the first at each time",
+            int(same[0]) + 2, len(same), len(time),
+        )  # fmt: skip
+    back = np.flatnonzero(np.diff(time) < 0)
+    if len(back):
+        _log.warning(
+            "scan %d: its time is %.3g s before that of the scan ahead of it; so for %d of %d scans, "
+            "which are taken in the order of the log, with poses written in the order of time",
+            int(back[0]) + 2, time[back[0]] - time[back[0] + 1], len(back), len(time),
+        )  # fmt: skip
+
+
+def check_wheels(log: LaserLog) -> None:
+    """Raise `InputError` where the wheels say one pose throughout while what the laser sees changes."""
+    if len(log) < 2 or np.ptp(log.odometry, axis=0).max() > _STILL:
+        return
+    alike = np.isclose(log.angles, log.angles[0])  # not so of interlaced lasers
+    changed = (alike & (np.abs(log.ranges - log.ranges[0]) > _CHANGED)).sum(axis=1) / np.maximum(alike.sum(axis=1), 1)
+    if (moved := int(np.argmax(changed > _MANY))) > 0:
+        raise InputError(
+            f"scan {moved + 1}: {100 * changed[moved]:.0f} % of the readings differ from those of the first scan, but "
+            "the wheels stand still throughout: expected odometry"
+        )

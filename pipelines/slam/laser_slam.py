@@ -11,14 +11,13 @@ that agrees with it. Along a bare corridor a scan tells no place.
 At the end false loops are found, and all keyframes are registered anew with every other pass of the same place, twice.
 """
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 
-from data_tools.laser import LaserLog
+from data_tools.laser import LaserLog, check_wheels, warn_of_times, without_jumps
 from data_tools.laser.mapping import SMEAR, Fit, LineMap, ScoreGrid, thinned
 from data_tools.lidar import Scan, Submap
 from pipelines.slam.drive import motion
@@ -39,73 +38,13 @@ from saga_fg.numerics import (
     inverse_transform,
     moved,
     transform,
-    transforms,
     vector,
-    vectors,
 )
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.pose_graph import PoseGraph, consensus, trusted
 from saga_fg.slam.pose_graph.optimisation import chosen_edges
 from saga_fg.slam.submaps import LoopClosure, SubmapSettings
 from saga_fg.slam.submaps.between import Motion
-
-_SLACK = 1.0  # m that a step of the wheels may be longer than the largest speed allows: logs come in bursts
-_STILL, _CHANGED, _MANY = 1e-6, 0.3, 0.3  # m of the wheels; m of a reading, and the share of a scan, that show motion
-_log = logging.getLogger(__name__)
-
-
-def without_jumps(log: LaserLog, largest_speed: float) -> tuple[FloatArray, int]:
-    """Poses (n, 3) of the wheels, where steps faster than `largest_speed` (m/s) count as standing still; their number.
-
-    Steps may be 1 m longer than that speed allows. Warns of the first one.
-    """
-    wheels = transforms(log.odometry)
-    step = np.linalg.inv(wheels[:-1]) @ wheels[1:]
-    way, seconds = np.hypot(step[:, 0, 2], step[:, 1, 2]), np.maximum(np.diff(log.time), 0.0)
-    jumps = np.flatnonzero(way > largest_speed * seconds + _SLACK)
-    if not len(jumps):
-        return log.odometry, 0
-    first = int(jumps[0])
-    _log.warning(
-        "scan %d: the wheels moved %.3g m in %.3g s, more than largest_speed, %g m/s, allows; "
-        "so in %d steps, which count as standing still",
-        first + 2, way[first], seconds[first], largest_speed, len(jumps),
-    )  # fmt: skip
-    for row in jumps.tolist():  # what follows moves by what the jump did
-        wheels[row + 1 :] = wheels[row] @ np.linalg.inv(wheels[row + 1]) @ wheels[row + 1 :]
-    return vectors(wheels), len(jumps)
-
-
-def warn_of_times(time: FloatArray) -> None:
-    """Warns where times (n,), s, run backwards, as those of logs that are written by several processes do, or stay."""
-    same = np.flatnonzero(np.diff(time) == 0)
-    if len(same):
-        _log.warning(
-            "scan %d: its time is that of the scan ahead of it; so for %d of %d scans, "
-            "of which the files have the pose of the first at each time",
-            int(same[0]) + 2, len(same), len(time),
-        )  # fmt: skip
-    back = np.flatnonzero(np.diff(time) < 0)
-    if len(back):
-        _log.warning(
-            "scan %d: its time is %.3g s before that of the scan ahead of it; so for %d of %d scans, "
-            "which are taken in the order of the log, with poses written in the order of time",
-            int(back[0]) + 2, time[back[0]] - time[back[0] + 1], len(back), len(time),
-        )  # fmt: skip
-
-
-def check_wheels(log: LaserLog) -> None:
-    """Raise `InputError` where the wheels say one pose throughout while what the laser sees changes."""
-    if len(log) < 2 or np.ptp(log.odometry, axis=0).max() > _STILL:
-        return
-    alike = np.isclose(log.angles, log.angles[0])  # not so of interlaced lasers
-    changed = (alike & (np.abs(log.ranges - log.ranges[0]) > _CHANGED)).sum(axis=1) / np.maximum(alike.sum(axis=1), 1)
-    if (moved := int(np.argmax(changed > _MANY))) > 0:
-        raise InputError(
-            f"scan {moved + 1}: {100 * changed[moved]:.0f} % of the readings differ from those of the first scan, but "
-            "the wheels stand still throughout: expected odometry"
-        )
-
 
 _FLOOR = np.array([0.01, 0.01, 0.002]) ** 2  # variance of a registration of any number of points, m^2 and rad^2
 _DETERMINED = 0.05  # ratio of information along and across below which a place is a bare corridor
