@@ -323,9 +323,11 @@ def degraded_odometry(
 ) -> OdometryIncrements:
     """Odometry with errors sampled from `noise`: independent ones, and random walks of scale, bias and course."""
     n, dt = len(odometry.a_T_b), odometry.dt
-    deviations = np.sqrt(np.diagonal(noise.covariances(odometry.distance, dt), axis1=1, axis2=2))
+    deviations = np.sqrt(
+        np.diagonal(noise.covariances(np.linalg.norm(odometry.a_T_b[:, :3, 3], axis=1), dt), axis1=1, axis2=2)
+    )
     sampled = deviations * rng.standard_normal(deviations.shape)
-    slow = rng.standard_normal(3) * [noise.scale, noise.bias, noise.course] + np.cumsum(sampled[:, 6:], axis=0)
+    slow = rng.standard_normal(3) * noise.slow + np.cumsum(sampled[:, 6:], axis=0)
     bias = np.zeros((n, 3))
     bias[:, 2] = slow[:, 1] * dt
     a_T_b = odometry.a_T_b.copy()

@@ -127,11 +127,6 @@ class SurfelMap:
         self._flat = self.surfels.select(self.surfels.flat)
         self._tree = cKDTree(self._flat.mean, balanced_tree=False, compact_nodes=False)
 
-    @property
-    def flat(self) -> Surfels:
-        """The flat surfels."""
-        return self._flat
-
     def nearest(self, points: FloatArray, farthest: float) -> tuple[IntArray, Surfels]:
         """Rows (K,) of the points that have a flat surfel with its mean within `farthest` m, and the surfel of each."""
         distance, row = self._tree.query(points, distance_upper_bound=farthest)
@@ -195,6 +190,11 @@ class Observability:
     def lost(self) -> FloatArray:
         """(k, 6) motions that are not determined."""
         return self.motions[self.surfels < self.needed]
+
+    def open(self, variance: float) -> FloatArray:
+        """Covariance (6, 6), rad^2 and m^2, of a tangent that has this variance, m^2, along each of those motions."""
+        motions = self.lost / self.scale
+        return np.asarray(variance * motions.T @ motions)
 
     @property
     def scale(self) -> FloatArray:

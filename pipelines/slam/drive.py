@@ -28,6 +28,7 @@ from saga_fg.errors import require_type
 from saga_fg.numerics import (
     FloatArray,
     carried_covariance,
+    checked,
     inverse_transform,
     transform_points,
 )
@@ -161,9 +162,7 @@ class SlamMap:
     origin: Origin | None = None
 
     def __post_init__(self) -> None:
-        if self.map_T_submap.shape != (len(self.points), 4, 4):
-            shape = self.map_T_submap.shape
-            raise InputError(f"map_T_submap: expected shape ({len(self.points)}, 4, 4), got {shape}")
+        checked("map_T_submap", self.map_T_submap, (len(self.points), 4, 4))
         if not any(map(len, self.points)):
             raise InputError("map: expected points in at least one submap, got none")
 

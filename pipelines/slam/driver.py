@@ -159,8 +159,7 @@ class MovingObjects:
         distance = np.linalg.norm(detections.boxes.position[:, :2], axis=1)
         near = detections.boxes.select((distance > _NEAR[0]) & (distance < _NEAR[1]))
         raised = replace(near, position=near.position + _GROUND / 2, size=near.size - 2 * np.abs(_GROUND))
-        for row in range(len(near)):
-            self._filled.append(bool(inside_boxes(scan.points, raised.select([row]), 0.0).any()))
+        self._filled += [bool(inside_boxes(scan.points, raised.select([row]), 0.0).any()) for row in range(len(near))]
         if len(self._filled) >= _JUDGED and np.mean(self._filled) < _FILLED:
             _LOG.warning(
                 "detections: expected boxes in the frame of the vehicle, at the times of the scans; of the first %d "

@@ -51,10 +51,8 @@ def observe_landmarks(points: FloatArray, detectors: Sequence[LandmarkDetector] 
     detectors: of further kinds of landmarks
     """
     ground = segment_ground(points)
-    found: list[Observation] = []
     walls = extract_walls(points[~ground.is_ground])
-    for wall in walls[:_WALLS]:
-        found.append(Observation(WALL, wall.coefficients, wall.covariance, wall.extent))
+    found = [Observation(WALL, wall.coefficients, wall.covariance, wall.extent) for wall in walls[:_WALLS]]
     poles = extract_poles(points, ground.height, walls)
     for pole in sorted(poles, key=lambda pole: float(np.hypot(*pole.foot[:2])))[:_POLES]:
         extent = np.stack([pole.foot, [*pole.foot[:2], pole.top]])

@@ -391,8 +391,7 @@ class Localiser:
         found = self._map.registered(points, predicted, not epoch)
         given: list[FactorProvider] = [MeasuredMotion(*since)]
         if found is not None:
-            lost = found.observed.lost / found.observed.scale
-            covariance = found.covariance + _ACCURACY + LOST_TRANSLATION**2 * lost.T @ lost
+            covariance = found.covariance + _ACCURACY + found.observed.open(LOST_TRANSLATION**2)
             seen = pose_prior_factor(key, found.map_T_scan, covariance, Robust("cauchy", ROBUST_SCALE))
             given.append(Given(Additions(factors=[seen]), "map"))
             self._fitted = self.way

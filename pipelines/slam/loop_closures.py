@@ -280,9 +280,8 @@ class PlaceLoops(LoopSearch):
         if fine is None:
             return None, 0.0
         overlap = Structure.of(old).shared(Structure.of(new), fine.map_T_scan)
-        seen = fine.observed
-        free = seen.lost.T / seen.scale[:, None]  # motions that surfaces leave open: by the image
-        covariance = fine.covariance + np.diag(_DISTORTION) + _OPEN**2 * free @ free.T
+        open_by_surfaces = fine.observed.open(_OPEN**2)  # known by the images
+        covariance = fine.covariance + np.diag(_DISTORTION) + open_by_surfaces
         return LoopClosure(match.number, number, fine.map_T_scan, covariance), overlap
 
     def _unrivalled(self, found: list[_Proved], frames: FloatArray) -> list[_Proved]:

@@ -298,8 +298,7 @@ class LidarOdometry:
             return np.zeros((6, 6))
         since, speed = self._open = self._open or (before, 0.0 if self._velocity_known else _UNKNOWN_SPEED)
         ended, begun = ((speed * t) ** 2 + _UNKNOWN_ACCELERATION**2 * t**3 / 3 for t in (now - since, before - since))
-        motions = observed.lost / observed.scale
-        return np.asarray(max(LOST_TRANSLATION**2, ended - begun) * motions.T @ motions)
+        return observed.open(max(LOST_TRANSLATION**2, ended - begun))
 
     def _fits(self, found: Registration, count: int) -> bool:
         """Whether a scan of so many points overlaps with the map, and lies on its surfels, as scans before it did."""

@@ -230,9 +230,8 @@ class SensorConsistency:
 
     def forget(self, since: float) -> None:
         """Drop the residuals from a time on, s, as the poses there turned out wrong."""
-        for scores in self._scores.values():
-            for key in [key for key in scores if key[0] >= since]:
-                del scores[key]
+        for name, scores in self._scores.items():
+            self._scores[name] = {key: score for key, score in scores.items() if key[0] < since}
 
     @property
     def misfits(self) -> dict[str, str]:

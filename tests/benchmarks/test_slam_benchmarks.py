@@ -98,7 +98,9 @@ def test_errors_have_the_deviations_of_the_model():
     expected = np.hypot(
         noise.scale * distance, np.sqrt(noise.distance_noise**2 * distance + noise.time_noise**2 * time)
     )
-    assert np.std([one.distance.sum() for one in drawn]) == pytest.approx(expected, rel=0.15)
+    assert np.std([np.linalg.norm(one.a_T_b[:, :3, 3], axis=1).sum() for one in drawn]) == pytest.approx(
+        expected, rel=0.15
+    )
     first = np.stack([one.a_T_b[0, :2, 3] for one in drawn])
     expected = np.hypot(noise.course, noise.distance_noise / np.sqrt(2.0))
     assert np.std(np.arctan2(first[:, 1], first[:, 0])) == pytest.approx(expected, rel=0.15)

@@ -42,6 +42,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import Self
 
 import numpy as np
@@ -147,17 +148,10 @@ class OdometryIncrements:
         """(n - 1,) s"""
         return np.diff(self.timestamps)
 
-    @property
-    def distance(self) -> FloatArray:
-        """(n - 1,) m"""
-        return np.asarray(np.linalg.norm(self.a_T_b[:, :3, 3], axis=1))
-
     def path(self, start: ArrayLike | None = None) -> FloatArray:
         """World_T_ego (n, 4, 4): the increments one after the other from `start` (4, 4), by default the identity."""
-        poses = [np.eye(4) if start is None else checked_transform("start", start)]
-        for increment in self.a_T_b:
-            poses.append(poses[-1] @ increment)
-        return np.stack(poses)
+        first = np.eye(4) if start is None else checked_transform("start", start)
+        return np.stack(list(accumulate(self.a_T_b, np.matmul, initial=first)))
 
 
 MAX_ITERATIONS = 30  # largest number of linearisations in each pass

@@ -34,7 +34,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import block_diag, csc_array, diags_array
@@ -52,63 +51,14 @@ _LEAST_RADIUS = 1e-12
 _MOST_STEPS, _MOST_INNER = 200, 300
 
 
-class Frames(NamedTuple):
-    """Y (N, d, r), its cost, and the number of products with Q of the way there."""
-
-    Y: FloatArray
-    cost: float
-    products: int
-
-
-def multipliers(Y: FloatArray, V: FloatArray) -> FloatArray:
-    """Symmetric parts (N, d, d) of V_i Y_i^T; of V = Q Y they are Lambda."""
-    product = V @ Y.swapaxes(1, 2)
-    return np.asarray((product + product.swapaxes(1, 2)) / 2)
-
-
-def nearest_frames(V: FloatArray) -> FloatArray:
-    """Orthonormal frames (N, d, r) nearest to V (N, d, r)."""
-    U, _, Wt = np.linalg.svd(V, full_matrices=False)
-    return np.asarray(U @ Wt)
-
-
-def best_frames(
-    Q: Product, preconditioner: Product, Y: FloatArray, tolerance: float, most_products: float = np.inf
-) -> Frames:
-    """A local minimum from a start Y (N, d, r). Q, preconditioner: products with (N d, r).
-
-    tolerance: decrease that a step of the preconditioner still promises, relative to the cost; most_products: with Q,
-    after which the way ends where it is
-    """
-    here = _Point(Q, preconditioner, np.ascontiguousarray(Y))
-    radius = np.sqrt(Y.shape[0] * Y.shape[1]) / 8
-    products = 0
-    for _ in range(_MOST_STEPS):
-        if here.slope <= tolerance * here.cost or radius < _LEAST_RADIUS or products >= most_products:
-            break
-        step, promised, at_bound, count = _truncated_cg(here, radius, min(_MOST_INNER, most_products - products))
-        products += count + 1
-        there = _Point(Q, preconditioner, nearest_frames(Y + step))
-        noise = _STEP_ROUNDING * here.cost
-        ratio = (here.cost - there.cost + noise) / (promised + noise)
-        if ratio < _POOR:
-            radius /= 4
-        elif ratio > _GOOD and at_bound:
-            radius *= 2
-        if ratio > _ACCEPTED:
-            here, Y = there, there.Y
-        elif promised <= _LEAST * here.cost:
-            break
-    return Frames(here.Y, here.cost, products)
-
-
 @dataclass(eq=False)
-class _Point:
-    """The form at frames Y."""
+class Frames:
+    """The form at frames Y (N, d, r); products: number of those with Q on the way there."""
 
     Q: Product
     preconditioner: Product
     Y: FloatArray
+    products: int = 0
 
     @cached_property
     def QY(self) -> FloatArray:
@@ -148,7 +98,50 @@ class _Point:
         return product(V.reshape(-1, V.shape[2])).reshape(V.shape)
 
 
-def _truncated_cg(at: _Point, radius: float, most: float) -> tuple[FloatArray, float, bool, int]:
+def multipliers(Y: FloatArray, V: FloatArray) -> FloatArray:
+    """Symmetric parts (N, d, d) of V_i Y_i^T; of V = Q Y they are Lambda."""
+    product = V @ Y.swapaxes(1, 2)
+    return np.asarray((product + product.swapaxes(1, 2)) / 2)
+
+
+def nearest_frames(V: FloatArray) -> FloatArray:
+    """Orthonormal frames (N, d, r) nearest to V (N, d, r)."""
+    U, _, Wt = np.linalg.svd(V, full_matrices=False)
+    return np.asarray(U @ Wt)
+
+
+def best_frames(
+    Q: Product, preconditioner: Product, Y: FloatArray, tolerance: float, most_products: float = np.inf
+) -> Frames:
+    """A local minimum from a start Y (N, d, r). Q, preconditioner: products with (N d, r).
+
+    tolerance: decrease that a step of the preconditioner still promises, relative to the cost; most_products: with Q,
+    after which the way ends where it is
+    """
+    here = Frames(Q, preconditioner, np.ascontiguousarray(Y))
+    radius = np.sqrt(Y.shape[0] * Y.shape[1]) / 8
+    products = 0
+    for _ in range(_MOST_STEPS):
+        if here.slope <= tolerance * here.cost or radius < _LEAST_RADIUS or products >= most_products:
+            break
+        step, promised, at_bound, count = _truncated_cg(here, radius, min(_MOST_INNER, most_products - products))
+        products += count + 1
+        there = Frames(Q, preconditioner, nearest_frames(Y + step))
+        noise = _STEP_ROUNDING * here.cost
+        ratio = (here.cost - there.cost + noise) / (promised + noise)
+        if ratio < _POOR:
+            radius /= 4
+        elif ratio > _GOOD and at_bound:
+            radius *= 2
+        if ratio > _ACCEPTED:
+            here, Y = there, there.Y
+        elif promised <= _LEAST * here.cost:
+            break
+    here.products = products
+    return here
+
+
+def _truncated_cg(at: Frames, radius: float, most: float) -> tuple[FloatArray, float, bool, int]:
     """The step, the decrease it promises, whether it ends at the bound of the trust region, and its iterations.
 
     Lengths are measured in the metric of the preconditioner, by recursion (Conn, Gould, Toint 2000, section 7.5.1).

@@ -56,7 +56,7 @@ from factors import (
     solve,
 )
 from saga_fg.errors import InputError
-from saga_fg.numerics import BoolArray, FloatArray, IntArray
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, checked
 from saga_fg.slam.pose_graph.certificate import ChordalMinimum, chordal_minimum
 from saga_fg.slam.pose_graph.chordal import chordal_poses, factorised
 from saga_fg.slam.pose_graph.graph import PoseGraph, trusted
@@ -96,12 +96,10 @@ class OptimisedPoses:
                 found = {row: self.solution.marginal(row) for row in chosen.tolist()}
             else:
                 found = self.solution.marginals()
-        except (RuntimeError, np.linalg.LinAlgError, FactorError) as error:
+            covariances = np.array([found[row] for row in chosen.tolist()]).reshape(-1, k, k)
+            return checked("covariances", covariances, (None, k, k))
+        except (RuntimeError, np.linalg.LinAlgError, FactorError, InputError) as error:
             raise InputError(f"{_UNLIKE}: the covariances of the poses cannot be computed") from error
-        covariances = np.array([found[row] for row in chosen.tolist()]).reshape(-1, k, k)
-        if not np.isfinite(covariances).all():
-            raise InputError(f"{_UNLIKE}: the covariances of the poses cannot be computed")
-        return covariances
 
 
 def optimise_poses(graph: PoseGraph, robust: Robust | None = None, certify: bool = False) -> OptimisedPoses:
@@ -388,34 +386,22 @@ def _snooped(
     problem: _Problem, values: gtsam.Values, loop: BoolArray, kept: BoolArray
 ) -> tuple[gtsam.Values, BoolArray]:
     """Take loops out and in, until all that are in pass the gate, and none besides."""
-    rows = np.flatnonzero(loop)
-    seen: set[bytes] = set()
-    squares = np.zeros(len(rows))
-    judged = np.ones(len(rows), dtype=bool)
-    kept = kept.copy()
+    rows, kept, seen = np.flatnonzero(loop), kept.copy(), {kept.tobytes()}
     for _ in range(_MOST_ROUNDS):
         values = problem.solved(values, kept)
-        whole = bool(judged.all())
-        squares[judged] = _judged(problem, values, rows[judged], kept)
-        inside = kept[rows]
+        squares, inside = _judged(problem, values, rows, kept), kept[rows]
         gate = float(chi2.ppf(_CERTAIN, problem.k))
         if inside.sum() >= _FEWEST:
             k = float(np.median(squares[inside])) / float(chi2.median(problem.k))
             gate = min(gate, _TAILS * k * problem.gate)
-        judged = inside | (squares < 10 * problem.gate)  # the others stay far out, unless the solution has improved
         outlying, fitting = inside & (squares > gate), ~inside & (squares <= gate)
         if outlying.any():
             kept[rows[outlying & (squares >= squares[outlying].max() / 2)]] = False
         elif fitting.any():
             kept[rows[np.argmin(np.where(fitting, squares, np.inf))]] = True
-        elif whole:
+        if kept.tobytes() in seen:
             break
-        else:
-            judged[:] = True
-            continue
-        if (state := kept.tobytes()) in seen:
-            break
-        seen.add(state)
+        seen.add(kept.tobytes())
     return problem.solved(values, kept), kept
 
 

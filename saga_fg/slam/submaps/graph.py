@@ -34,7 +34,7 @@ from factors import Robust, SolverSettings
 from saga_fg.errors import InputError
 from saga_fg.estimators import BatchSolver, GraphSolution, IncrementalSmoother, RelinearisationSettings
 from saga_fg.graph import Additions, FactorProvider, GraphView, SceneFactorGraph, ask_all
-from saga_fg.numerics import FloatArray, inverse_transform
+from saga_fg.numerics import FloatArray, inverse_transform, transform_points
 from saga_fg.settings import Positive, Range, Settings, setting
 from saga_fg.slam.mapping import (
     Given,
@@ -60,49 +60,41 @@ _GAP = 3.0  # m
 _ANCHOR = 1e-12 * np.eye(6)  # covariance of the anchor in its own frame
 
 
+@dataclass(frozen=True, eq=False)
 class SubmapLandmarks:
-    """The landmarks of one submap, seen from its anchor on."""
+    """The landmarks of one submap, seen from its anchor on.
 
-    def __init__(self) -> None:
-        self._local = LocalMap(np.eye(4), _ANCHOR)
-        self._ends: dict[int, FloatArray] = {}  # (2, 2) of walls and lines, from above
+    local  pose and landmarks; ends: by number (2, 2) of walls and lines, from above
+    """
+
+    local: LocalMap = field(default_factory=lambda: LocalMap(np.eye(4), _ANCHOR))
+    ends: dict[int, FloatArray] = field(default_factory=dict)
 
     def copy(self) -> SubmapLandmarks:
         """A copy that further observations can be associated with."""
-        twin = SubmapLandmarks()
-        twin._local, twin._ends = self._local.copy(), dict(self._ends)
-        return twin
-
-    def move(self, a_T_b: FloatArray, covariance: FloatArray) -> None:
-        """Go on to the next pose: covariance (6, 6) of the motion's tangent."""
-        self._local.predict(a_T_b, covariance)
+        return SubmapLandmarks(self.local.copy(), dict(self.ends))
 
     def observe(self, observations: Sequence[Observation], first: int) -> list[int]:
         """Return the number of the landmark of each observation; new ones are numbered from `first` > 0 on."""
-        ends = [self._from_above(one) for one in observations]
+        T = self.local.pose.matrix()
+        ends = [None if one.extent is None else transform_points(T, one.extent)[:, :2] for one in observations]
 
         def near(row: int, landmark: int) -> bool:
-            return _gap(self._ends.get(landmark), ends[row]) <= _GAP
+            return _gap(self.ends.get(landmark), ends[row]) <= _GAP
 
-        pairs = associate(self._local, observations, near)
+        pairs = associate(self.local, observations, near)
         if pairs:
-            self._local.update(list(pairs.values()))
-        taken = []
+            self.local.update(list(pairs.values()))
+        taken = list[int]()
         for row, observation in enumerate(observations):
-            if row in pairs:
-                taken.append(pairs[row].landmark)
-            else:
-                self._local.augment(first, observation)
-                taken.append(first)
+            number = pairs[row].landmark if row in pairs else first
+            if number == first:
+                self.local.augment(first, observation)
                 first += 1
             if (seen := ends[row]) is not None:
-                self._ends[taken[-1]] = _together(self._ends.get(taken[-1]), seen)
+                self.ends[number] = _together(self.ends.get(number), seen)
+            taken.append(number)
         return taken
-
-    def _from_above(self, observation: Observation) -> FloatArray | None:
-        """Ends (2, 2) of what was observed, from above."""
-        T = self._local.pose.matrix()
-        return None if observation.extent is None else (observation.extent @ T[:3, :3].T + T[:3, 3])[:, :2]
 
 
 def _gap(known: FloatArray | None, seen: FloatArray | None) -> float:
@@ -152,13 +144,9 @@ class Recorded:
         return [Given(one, self.name) for one in self.additions.get(epoch, ())]
 
     def _kept(self, view: GraphView, added: Additions) -> Additions:
-        if isinstance(added, Additions) and (added.variables or len(_list(added.factors)) or added.named):
+        if isinstance(added, Additions):
             self.additions.setdefault(view.epoch, []).append(added)
         return added
-
-
-def _list(factors: Any) -> Sequence[Any]:
-    return factors if isinstance(factors, Sequence) else [factors]
 
 
 @dataclass(frozen=True)
@@ -263,7 +251,7 @@ class SubmapGraph:
         start = measured[0] if k == 0 else self.pose(k - 1) @ measured[0]
         landmarks = SubmapLandmarks() if begins else self._landmarks.copy()
         if motion is not None and not begins:
-            landmarks.move(*motion)
+            landmarks.local.predict(*motion)
         numbers = landmarks.observe(observations, self._numbers)
         now = list(zip(numbers, observations, strict=True))
         motion_provider = MeasuredMotion(*measured, start)
