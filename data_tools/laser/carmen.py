@@ -27,7 +27,7 @@ import numpy as np
 
 from data_tools.files import isolated, read_text
 from saga_fg.errors import InputError
-from saga_fg.numerics import FloatArray, transforms, vectors
+from saga_fg.numerics import FloatArray, refuse, transforms, vectors
 
 _RECORDS = ("FLASER", "ROBOTLASER1")
 _UNPACK: dict[str, Callable[..., Any]] = {".bz2": bz2.open, ".gz": gzip.open}
@@ -162,10 +162,8 @@ def _numbers(where: str, fields: list[str]) -> FloatArray:
         raise InputError(f"{where}: expected numbers, {error}") from error
     bad = ~(np.abs(values) < 1e15)
     bad[1:] |= np.abs(values[1:]) > _LARGEST
-    if bad.any():
-        raise InputError(
-            f"{where}: expected finite numbers of the size of rooms, got {fields[int(np.argmax(bad))]!r:.40}"
-        )
+    expected = "expected finite numbers of the size of rooms"
+    refuse(bad, lambda row: InputError(f"{where}: {expected}, got {fields[row]!r:.40}"))
     return values
 
 

@@ -32,6 +32,7 @@ from saga_fg.numerics import (
     checked_covariances,
     checked_ids,
     checked_rows,
+    refuse,
 )
 
 _FLAT = 1e-9  # of the largest coordinate, below which known places lie on one line
@@ -192,8 +193,7 @@ class PoseGraph:
         for name, rows in (("first", first), ("second", second)):
             if ((rows < 0) | (rows >= len(ids))).any():
                 raise InputError(f"{name}: expected rows of the {len(ids)} poses, from 0")
-        if (first == second).any():
-            raise InputError(f"second[{int(np.argmax(first == second))}]: expected another pose than the first")
+        refuse(first == second, lambda row: InputError(f"second[{row}]: expected another pose than the first"))
         poses = _checked_transforms("world_T_pose", self.world_T_pose, len(ids), d)
         between = _checked_transforms("first_T_second", self.first_T_second, len(first), d)
         information = checked_covariances("information", self.information, len(first), 3 * (d - 1))
@@ -273,10 +273,8 @@ class PoseGraph:
 
     def check_connected(self) -> None:
         """Raise `InputError` for a graph that measurements between poses do not connect."""
-        apart = self.components() != 0
-        if apart.any():
-            named = int(self.ids[apart][0])
-            raise InputError(f"pose {named}: expected measurements that connect it with the first pose")
+        expected = "expected measurements that connect it with the first pose"
+        refuse(self.components() != 0, lambda row: InputError(f"pose {self.ids[row]}: {expected}"))
 
     def components(self) -> IntArray:
         """Return the connected component (N,) of each pose, numbered from 0 in the order of their first poses."""
@@ -315,6 +313,5 @@ def _checked_transforms(name: str, value: FloatArray, count: int, d: int) -> Flo
     R = T[:, :d, :d]
     skew = np.abs(R @ R.swapaxes(1, 2) - np.eye(d)).max(axis=(1, 2), initial=0.0)
     bad = (skew > _ORTHONORMAL) | (np.linalg.det(R) < 0) | (T[:, d] != np.eye(d + 1)[d]).any(axis=1)
-    if bad.any():
-        raise InputError(f"{name}[{int(np.argmax(bad))}]: expected a rigid transform (orthonormal rotation)")
+    refuse(bad, lambda row: InputError(f"{name}[{row}]: expected a rigid transform (orthonormal rotation)"))
     return T
