@@ -41,7 +41,7 @@ from saga_fg.tracking import (
     Traffic,
     TrafficSettings,
     motion_of,
-    predict,
+    predict_state,
 )
 from saga_fg.types import LabelledObjects, Scene
 
@@ -289,7 +289,7 @@ class HiddenObjects(Columns):
             state.rules = tuple(_Onto(rule, n) for rule in rules)
             state.time, state.table = s * STEP, scene.table
             state.joint = JointTrackState(marginals, partial(motion_of, settings))
-            predict(state, (s + 1) * STEP)
+            predict_state(state, (s + 1) * STEP)
             now = state.reported_kinematics()
             found.position[rows, s], found.P[rows, s] = now.position[:n] - shift[rows], now.P[:n]
             hidden = RecordedTracks(state.table.select(slice(0, n)), marginals.means[:n], marginals.covariances[:n])

@@ -7,6 +7,7 @@ from .joint_state import JointTrackState
 from .journal import Event, Journal, Observer, Stage, TrackerView, of_scene
 from .map_nodes import motion_of
 from .measurements import frame_measurements
+from .prediction import predict_state
 from .sensor_noise import scaled_sensors
 from .settings import (
     AssociationCost,
@@ -66,6 +67,7 @@ __all__ = [
     "motion_of",
     "of_scene",
     "predict",
+    "predict_state",
     "read_scenes",
     "scaled_sensors",
     "track",

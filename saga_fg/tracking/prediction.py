@@ -157,7 +157,7 @@ MAX_STEPS = 100  # that an interval is predicted in
 LOOKAHEAD_STEP = 0.5  # s, the longest with the same edges; a shorter `max_step` counts
 
 
-def predict(state: TrackerState, time: float, ahead: bool = False) -> None:
+def predict_state(state: TrackerState, time: float, ahead: bool = False) -> None:
     """Predict to a `time` counted from the state's start, s, which is not before the state's.
 
     ahead: of all detections to come, so that the headings of detected tracks too turn with their velocities.
@@ -305,7 +305,7 @@ def _predict_to(state: TrackerState, time: float) -> None:
     begin, elapsed = state.time, time - state.time
     steps = math.ceil(elapsed / LOOKAHEAD_STEP - 1e-9)
     for k in range(1, steps + 1):
-        predict(state, time if k == steps else begin + k * elapsed / steps, ahead=True)
+        predict_state(state, time if k == steps else begin + k * elapsed / steps, ahead=True)
 
 
 def _joint_covariance(state: TrackerState, rows: IntArray, own: FloatArray) -> FloatArray:

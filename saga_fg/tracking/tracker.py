@@ -32,7 +32,7 @@ from saga_fg.tracking.clock_offsets import SensorTime, compared, sensor_times
 from saga_fg.tracking.journal import Observer, Stage, TrackerView
 from saga_fg.tracking.map_nodes import MapNodes
 from saga_fg.tracking.measurements import frame_measurements
-from saga_fg.tracking.prediction import judge_edges, look_ahead, predict
+from saga_fg.tracking.prediction import judge_edges, look_ahead, predict_state
 from saga_fg.tracking.relinking import hand_over
 from saga_fg.tracking.sensor_noise import UNMEASURED, SensorNoise, for_gates, observed, with_scale
 from saga_fg.tracking.settings import TrackerSettings
@@ -174,7 +174,7 @@ class Tracker:
             if named is not None:
                 state.traffic.add_lanes(named.lanes)
         state.joint.set_frame(frame, state.origin)
-        predict(state, max(time, before))
+        predict_state(state, max(time, before))
         frame = state.ego.located(frame, state.world_T_ego)
         if delay == 0:
             state.ego.update(frame, state.time, state.origin, state.joint)
@@ -246,7 +246,7 @@ class Tracker:
         if timestamp <= newest:
             return report_tracks(self._state, timestamp)
         ahead = self._state.copied()
-        predict(ahead, ahead.relative(min(timestamp, newest + LATEST)))
+        predict_state(ahead, ahead.relative(min(timestamp, newest + LATEST)))
         return report_tracks(ahead, timestamp)
 
     def predict(self, horizons: ArrayLike, joint: bool = False, since: float | None = None) -> PredictedTracks:
