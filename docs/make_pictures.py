@@ -77,9 +77,10 @@ def main() -> None:
     if data := os.environ.get("SAGA_FG_DATA"):
         write_gap_picture(HERE / "gap.png", Path(data))
     with tempfile.TemporaryDirectory() as folder:
-        result = run_demo(Path(folder) / "demo", load_config("simulated"))
-        write_birds_eye_picture(HERE / "birds_eye.png", result.comparison, load_config("simulated"))
-        screenshot(result.page.resolve().as_uri(), HERE / "report.png", 1300, 920)
+        demo = Path(folder) / "demo"
+        comparison = run_demo(demo, load_config("simulated"))
+        write_birds_eye_picture(HERE / "birds_eye.png", comparison, load_config("simulated"))
+        screenshot((demo / "index.html").resolve().as_uri(), HERE / "report.png", 1300, 920)
         write_review_picture(HERE / "review.png", Path(folder) / "labels")
         frames, truth, odometry = degraded_drive(simulate_scene(street(), 0), JointSettings(), "lidar", 0)
         start, config = truth.world_T_ego[0], load_config("simulated")

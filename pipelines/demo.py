@@ -17,11 +17,9 @@ from pipelines.report import Report, report_page, scene_of_run
 from pipelines.tracking import Progress, TrackedScene, track_scene
 from saga_fg import Dataset, InputError, Scene
 from saga_fg.numerics import IntArray
+from saga_fg.types import DEFAULT
 
-__all__ = [
-    "DemoResult",
-    "run_demo",
-]
+__all__ = ["run_demo"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,14 +89,6 @@ TABLE_TITLE = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class DemoResult:
-    """The comparison, and the path of the page."""
-
-    comparison: Comparison
-    page: Path
-
-
 def run_demo(
     output: Path,
     config: TrackConfig,
@@ -106,7 +96,7 @@ def run_demo(
     scenes: int = 3,
     seed: int = 0,
     progress: Progress | None = None,
-) -> DemoResult:
+) -> Comparison:
     """Run the demonstration and write `index.html` into the folder `output`.
 
     Raises `InputError` where the folder can't be written, before any work is done.
@@ -115,7 +105,7 @@ def run_demo(
         comparison = compare(SimulatedTraffic(simulator, scenes, seed), config, METHODS, progress=progress)
         scene, moment = hardest_moment(comparison)
         (folder / "index.html").write_text(report_page(_report(comparison, config, scene, moment)), encoding="utf-8")
-    return DemoResult(comparison, output / "index.html")
+    return comparison
 
 
 def _report(comparison: Comparison, config: TrackConfig, first: int, start: int) -> Report:
@@ -169,5 +159,7 @@ def write_simulated_tables(directory: str | Path, dataset: SimulatedTraffic) -> 
             (folder / name).mkdir()
             write_tables(folder / name, scene)
             road_map = scene.frames[0].road_map if scene.frames else None
-            settings = replace(shipped, tracker=replace(shipped.tracker, road_map=road_map))
+            labels = {DEFAULT, *(label for frame in scene.frames for label in frame.detections.boxes.label.tolist())}
+            classes = {label: each for label, each in shipped.tracker.classes.items() if label in labels}
+            settings = replace(shipped, tracker=replace(shipped.tracker, road_map=road_map, classes=classes))
             write_text(folder / name / "settings.yaml", write_settings(settings))

@@ -13,7 +13,7 @@ from pipelines.cli.options import dataset_commands
 from pipelines.config import load_config, load_interactions
 from pipelines.configuration import write_settings
 from pipelines.learning import learn_noise, learned_fragment, scenes_to_learn_from
-from pipelines.learning.interactions import LearningSettings, learn_interactions, learned_figures, learned_tables
+from pipelines.learning.interactions import learn_interactions, learned_figures, learned_tables
 
 
 def _interactions(
@@ -51,7 +51,7 @@ def _interactions(
     learned_from = "ground truth" if with_truth else "tracks"
     origin = f"{learned_from} of {counted(len(found), 'recording')}, {source.name}: {', '.join(found)}"
     with progress_bar(unit="runs") as progress:
-        learned = learn_interactions(found, origin, settings, begin, LearningSettings(passes), progress)
+        learned = learn_interactions(found, origin, settings, begin, passes, progress)
     write_text(output, write_settings(learned.interactions))
     report(learned_tables(learned), learned_figures(learned), json_file, markdown)
     edges = learned.interactions.edges

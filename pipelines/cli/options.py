@@ -409,7 +409,7 @@ def _examples(verb: Verb, source: Source, examples: tuple[str, ...]) -> str:
     recordings = f"{source.name} {options}"
     result = "labels" if verb == "evaluate labels" else source.written.tracks_example
     beside = f"{source.name} {result} {''.join(arguments)}{options}"
-    if verb == "evaluate" and source.truth_option:
+    if verb in ("evaluate", "evaluate labels") and source.truth_option:
         recordings = f"{source.name} {''.join(arguments)}{options} {source.truth_option} truth.csv"
         beside = f"{source.name} {result} {source.truth_option} truth.csv"
     lines = []

@@ -147,11 +147,11 @@ def demo(
     with progress_bar() as progress:
         family = "simulated" if scenario in ("traffic", "two-sensors") else "heterogeneous"
         settings = load_config(family, config)
-        result = run_demo(output, settings, scenario_settings(scenario), scenes, seed, progress)
+        comparison = run_demo(output, settings, scenario_settings(scenario), scenes, seed, progress)
     title = f"{counted(scenes, 'simulated scene')}, seed {seed}"
-    show_tables([comparison_table(result.comparison, title)])
+    show_tables([comparison_table(comparison, title)])
     typer.echo(READING)
-    typer.echo(f"page: {result.page}")
+    typer.echo(f"page: {output / 'index.html'}")
 
 
 MAPLESS: tuple[ScenarioName, ...] = ("traffic", "two-sensors")

@@ -40,7 +40,7 @@ from data_tools.metrics.scene import match_scene
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, track_scene
 from saga_fg.errors import InputError
-from saga_fg.learning import MAX_GAPS, TEMPLATE, HiddenObjects, Rule, fit_interactions, hidden_objects
+from saga_fg.learning import TEMPLATE, HiddenObjects, Rule, fit_interactions, hidden_objects
 from saga_fg.learning.hidden_objects import FOLLOWED
 from saga_fg.learning.labelled_scene import LENGTHS, LONGEST, Gap, LabelledScene, made_gaps, reached
 from saga_fg.model import AccelerationLaw, Following, LearnedInteractions, Neighbours, Sensor
@@ -192,18 +192,6 @@ PLACE_NOISE = 0.1  # m: differences below it do not count
 Rules = tuple[Rule, ...]
 
 
-@dataclass(frozen=True)
-class LearningSettings:
-    """Settings of learning and of its test on recordings held out.
-
-    passes   number of times that each recording held out is tracked, each time with other made gaps
-    most     largest number of gaps to learn from, a random sample
-    """
-
-    passes: int = 2
-    most: int = MAX_GAPS
-
-
 @dataclass(frozen=True, eq=False)
 class LearnedForms:
     """The learned interactions; the form of each group of classes; runs on recordings held out, of three contenders.
@@ -232,17 +220,17 @@ def learn_interactions(
     origin: str,
     config: TrackConfig,
     start: LearnedInteractions | None = None,
-    settings: LearningSettings | None = None,
+    passes: int = 2,
     progress: Progress | None = None,
 ) -> LearnedForms:
     """Learn from annotated scenes with detections; `origin` says in the file where from.
 
     config   of the tracker: its motion, turns and stationarity are the base on which edges are learned
     start    rules from which the search begins, in place of the forms of the template
+    passes   number of times that each recording held out is tracked, each time with other made gaps
 
     Raises `InputError` where no object is followed for long enough.
     """
-    settings = settings or LearningSettings()
     gaps: dict[str, HiddenObjects | None] = {}
     for done, (name, scene) in enumerate(scenes.items()):
         gaps[name] = hidden_objects(scene, config.tracker, config.sensors)
@@ -263,7 +251,7 @@ def learn_interactions(
         found: dict[str, Rules] = {}
         for done, (form, rules) in enumerate(forms.items()):
             if own := _of_group(rules, group):
-                found[form] = fit_interactions(mine, config.tracker, own, most=settings.most).rules
+                found[form] = fit_interactions(mine, config.tracker, own).rules
             if progress is not None:
                 progress(f"fit {form}, {group[0]}, ...", done + 1, len(forms))
         return found
@@ -273,7 +261,7 @@ def learn_interactions(
         _Part(tested, {group: fitted(tuple(taught), templates, group) for group in groups})
         for taught, tested in ((first, second), (second, first))
     ]
-    trials = _trials(parts, config, origin, settings, progress)
+    trials = _trials(parts, config, origin, passes, progress)
     ratios, chosen = {}, {}
     for group in groups:
         ratios[group] = {form: _ratio(runs, trials[BASE], group) for form, runs in trials.items() if form != BASE}
@@ -298,7 +286,7 @@ def learn_interactions(
         for part in parts:
             if part.tested:
                 learned = Contender(LEARNED, "saga", config.with_interactions(combined(part.rules, origin)))
-                runs += judged_on(part.tested, [learned], settings.passes, SEED, progress)
+                runs += judged_on(part.tested, [learned], passes, SEED, progress)
     everything = {
         group: fitted(tuple(scenes), {form: templates[form]}, group)
         for group, form in chosen.items()
@@ -347,7 +335,7 @@ def _trials(
     parts: Sequence[_Part],
     config: TrackConfig,
     origin: str,
-    settings: LearningSettings,
+    passes: int,
     progress: Progress | None,
 ) -> dict[str, list[Run]]:
     """The runs of every form on the recordings held out, by form."""
@@ -362,7 +350,7 @@ def _trials(
                 learned_from=origin, edges=rules, explained_noise=config.tracker.explained_noise
             )
             contenders.append(Contender(form, "saga", config.with_interactions(learned)))
-        for run in judged_on(part.tested, contenders, settings.passes, SEED, progress):
+        for run in judged_on(part.tested, contenders, passes, SEED, progress):
             found.setdefault(run.contender, []).append(run)
     return found
 

@@ -24,7 +24,6 @@ from pipelines.learning.interactions import (
     NOWHERE,
     SHIPPED,
     Contender,
-    LearningSettings,
     coupled_classes,
     held_out_parts,
     judged_on,
@@ -43,7 +42,6 @@ from tests.saga_fg.following_pairs import RATE, following_pairs
 
 run = CliRunner().invoke
 FOLLOW = Following(CarFollowing(time_constant=float("inf")), rate=RATE, gap_scale=100.0)
-QUICK = LearningSettings(passes=1)
 
 
 @pytest.fixture(scope="module")
@@ -57,14 +55,14 @@ def scenes():
 def with_template(monkeypatch, *rules, fit=None):
     """Learning finds these rules, whatever the recordings say."""
     monkeypatch.setattr(learned_module, "TEMPLATE", rules)
-    found = fit or (lambda sample, settings, template, most: FittedInteractions(tuple(template), 0.0))
+    found = fit or (lambda sample, settings, template: FittedInteractions(tuple(template), 0.0))
     monkeypatch.setattr(learned_module, "fit_interactions", found)
 
 
 def test_the_form_that_does_best_on_recordings_held_out_is_the_form_that_is_written(monkeypatch, scenes):
     with_template(monkeypatch, FOLLOW, fit=partial(fit_interactions, iterations=2))
     config = load_config("file")
-    found = learn_interactions(scenes, "two scenes", config, settings=QUICK)
+    found = learn_interactions(scenes, "two scenes", config, passes=1)
     (group,) = (group for group in found.forms if "car" in group)
     ratios = found.ratios[group]
     assert set(ratios) == {"everywhere", "hidden", "refitted", SHIPPED}
@@ -98,7 +96,7 @@ def test_edges_that_raise_errors_are_left_out_and_the_base_motion_remains(monkey
     with_template(monkeypatch, replace(FOLLOW, interaction=Halting()))
     config = load_config("file")
     config = replace(config, tracker=replace(config.tracker, edges=()))
-    found = learn_interactions(scenes, "two scenes", config, settings=QUICK)
+    found = learn_interactions(scenes, "two scenes", config, passes=1)
     assert set(found.forms.values()) == {NOWHERE}
     assert found.interactions.edges == ()
 
@@ -114,7 +112,7 @@ def test_the_base_motion_is_the_tracker_that_is_written_if_no_form_helps(monkeyp
         return judged_on(scenes, contenders, *args)
 
     monkeypatch.setattr(learned_module, "judged_on", judge)
-    found = learn_interactions(scenes, "two scenes", config, settings=QUICK)
+    found = learn_interactions(scenes, "two scenes", config, passes=1)
     assert set(found.forms.values()) == {NOWHERE}
     written = config.with_interactions(found.interactions)
     base = [each.config.of_method(each.method) for each in tried if each.name == BASE]
@@ -124,13 +122,13 @@ def test_the_base_motion_is_the_tracker_that_is_written_if_no_form_helps(monkeyp
 def test_a_search_begins_with_the_rules_of_an_earlier_result(monkeypatch, scenes):
     begun = []
 
-    def fit(sample, settings, template, most):
+    def fit(sample, settings, template):
         begun.append(tuple(template))
         return FittedInteractions(tuple(template), 0.0)
 
     with_template(monkeypatch, fit=fit)
     start = LearnedInteractions(edges=(replace(FOLLOW, information_gain=True),))
-    found = learn_interactions(scenes, "two scenes", load_config("file"), start, QUICK)
+    found = learn_interactions(scenes, "two scenes", load_config("file"), start, 1)
     assert set(begun) == {start.edges}
     assert set(found.ratios[found_group(found)]) == {"refitted", SHIPPED}
 
@@ -147,7 +145,7 @@ def test_nothing_to_learn_from_is_an_error_and_halves_are_held_out():
     assert first["c"].frames[-1].timestamp < second["c"].timestamps[0] == second["c"].frames[0].timestamp
     short = {name: following_pairs(pairs=1, moments=6, name=name) for name in "ab"}
     with pytest.raises(InputError, match=r"nothing: expected objects that are followed for 1\.5 s and more"):
-        learn_interactions(short, "nothing", load_config("file"), settings=QUICK)
+        learn_interactions(short, "nothing", load_config("file"), passes=1)
 
 
 def test_classes_between_which_there_are_edges_are_one_group():

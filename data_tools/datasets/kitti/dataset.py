@@ -263,11 +263,11 @@ class KittiTracking:
 
     def _frames(self, name: str, times: FloatArray, poses: FloatArray, world_T_camera: FloatArray) -> list[Frame]:
         assert self._detections is not None
-        found = read_kitti_detections(self._detections, name, len(times))
+        frame, type_, found, score = read_kitti_detections(self._detections, name, len(times))
         with error_context(f"{self._detections}: sequence {name}"):
-            boxes = camera_boxes_to_world(found.boxes, np.strings.lower(found.type), world_T_camera[found.frame])
-            seen = Detections(boxes, found.score)
-        bounds = np.searchsorted(found.frame, np.arange(len(times) + 1)).tolist()
+            boxes = camera_boxes_to_world(found, np.strings.lower(type_), world_T_camera[frame])
+            seen = Detections(boxes, score)
+        bounds = np.searchsorted(frame, np.arange(len(times) + 1)).tolist()
         return [
             Frame(time, self._sensor, seen.select(slice(bounds[k], bounds[k + 1])), poses[k], token=f"{k:06d}")
             for k, time in enumerate(times.tolist())

@@ -23,7 +23,6 @@ image. The observation angle is alpha = rotation_y - atan2(x, z). Pixels count f
 """
 
 import logging
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -91,20 +90,13 @@ CLASS_CODES = {"Pedestrian": 1, "Car": 2, "Cyclist": 3}
 _NUMBERS = ("x1", "y1", "x2", "y2", "score", "h", "w", "l", "x", "y", "z", "rotation_y", "alpha")
 
 
-@dataclass(frozen=True, eq=False)
-class KittiDetections:
-    """Detections of a sequence, sorted by frame: frame (N,), type (N,) as KITTI names it, boxes (N), score (N,)."""
+def read_kitti_detections(
+    folder: str | Path, sequence: str, frames: int
+) -> tuple[IntArray, StrArray, CameraBoxes, FloatArray]:
+    """The detections of all classes of one sequence of so many frames, sorted by frame.
 
-    frame: IntArray
-    type: StrArray
-    boxes: CameraBoxes
-    score: FloatArray
-
-
-def read_kitti_detections(folder: str | Path, sequence: str, frames: int) -> KittiDetections:
-    """The detections of all classes of one sequence of so many frames.
-
-    Raises `InputError` if no class has a file for the sequence, and for lines that are not as above.
+    They are given as frame (N,), type (N,) as KITTI names it, boxes (N), score (N,). Raises `InputError` if no class
+    has a file for the sequence, and for lines that are not as above.
     """
     present = detection_files(Path(folder), sequence)
     for name in CLASS_CODES.keys() - present.keys():
@@ -116,7 +108,7 @@ def read_kitti_detections(folder: str | Path, sequence: str, frames: int) -> Kit
     order = np.argsort(frame, kind="stable")
     numbers = numbers[order]
     boxes = CameraBoxes(numbers[:, 5:8], numbers[:, 8:11], numbers[:, 11])
-    return KittiDetections(frame[order], type_[order], boxes, numbers[:, 4])
+    return frame[order], type_[order], boxes, numbers[:, 4]
 
 
 def detection_files(folder: Path, sequence: str) -> dict[str, Path]:
