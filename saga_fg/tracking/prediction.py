@@ -84,7 +84,7 @@ def known_courses(state: TrackerState, dt: float, paths: Paths) -> tuple[tuple[K
 
     Returned as well: the headings after it (n,), rad, of those that keep to their `paths`, NaN of others.
     """
-    table, velocity = state.table, state.kinematics().velocity
+    table, (place, velocity, *_) = state.table, state.kinematics()
     turn_time, found, after = np.zeros(len(table)), [], np.full(len(table), np.nan)
     path = np.full(len(table), -1)
     path[paths.row] = np.arange(len(paths))
@@ -109,8 +109,13 @@ def known_courses(state: TrackerState, dt: float, paths: Paths) -> tuple[tuple[K
             coasting = table.coasting(state.time)[rows[led]]
             settling[led], across[led] = _across(own, speed[led], coasting, motion.course_time)
             typical, weight = typical_speed(own, distance)
-            pull[led] = weight / (weight + 1) * np.where(speed[led] > MOVING, typical - speed[led], 0.0) / FLOW_TIME
-            after[rows[led]] = wrap_angle(heading[led] + turn)
+            flow = weight / (weight + 1) * np.where(speed[led] > MOVING, typical - speed[led], 0.0) / FLOW_TIME
+            vehicles = rows[led]
+            if not state.map_nodes.beliefs:  # else lights say who goes
+                ids = table.id[vehicles]
+                flow = state.right_of_way.accelerations(ids, place[vehicles], heading[led], speed[led], flow)
+            pull[led] = flow
+            after[vehicles] = wrap_angle(heading[led] + turn)
             rate[led] = turn / turning_time(motion, dt)
         mean = state.joint.estimator.mean(table.id[rows])
         ids, unseen = table.id[rows], Unseen(settling, across, pull)
@@ -206,7 +211,7 @@ def judge_edges(state: TrackerState) -> None:
     state.edge_record = state.edge_record.later(state.rules, nodes, seen, time)
     if state.right_of_way.due(time):
         table = state.table
-        able = seen & table.confirmed & of_classes(table.label, VEHICLES)
+        able = table.confirmed & of_classes(table.label, VEHICLES)
         unmoved = np.flatnonzero(able & ~table.has_moved)
         place = nodes.position[unmoved] + state.origin
         able[unmoved] = ~state.traffic.passes_beside(table.box.yaw[unmoved], place)  # else it is parked

@@ -13,6 +13,11 @@ and the order of arrival. The probability that i yields to j is
 
 smoothed over `SMOOTHING` s. V, w are fitted to simulated crossings and merges of known rules, by
 `python -m benchmarks right-of-way --fit`.
+
+Vehicles that are not detected are judged by where they are predicted. Such a vehicle waits with the probability P, the
+largest of its p, and its acceleration along its path is the mean of both, d m before its line and a where it goes on:
+
+    a' = (1 - P) a - P min( v^2 / (2 d), `HARDEST` )
 """
 
 import math
@@ -24,7 +29,7 @@ import numpy as np
 from scipy.special import expit
 
 from saga_fg.kernels.paths import path_meetings
-from saga_fg.model import NodeTable, Paths, unit
+from saga_fg.model import NodeTable, Paths, ahead_and_aside, unit
 from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.tracking.edge_record import Lines
 from saga_fg.tracking.right_of_way_weights import HIDDEN, OUT
@@ -41,6 +46,7 @@ ALIKE, HEAD_ON = 0.8, -0.9  # cosine between courses that come together, and of 
 LOOKS, AHEAD, FARTHEST = 25.0, 5.0, 60.0  # m, and s, for which paths are followed, to so many m
 CROSSING, JOINING = 5.0, 20.0  # m before a meeting point, where vehicles wait at unknown lines
 ARRIVES, SOON = 4.0, 0.5  # m before the line; s, in which a vehicle arrives at the earliest that has not
+AT_LINE, PASSED, HARDEST = 0.3, 1.0, 4.0  # m before and beyond a line, where vehicles stand and have left; m/s^2
 GOES, CRUISE, SLOW = 1.8, 10.0, 2.0  # m/s^2 and m/s of a vehicle that goes on freely; m/s
 
 Pair = tuple[int, int]
@@ -63,12 +69,14 @@ class RightOfWay:
     motion       speed, m/s, and acceleration, m/s^2, of vehicles, by id
     arrived      when they have arrived, s, by id
     probability  that the first of two yields to the second, by ids
+    line         place (2,), local, m, at which vehicles would wait for those whose paths cross theirs, by id
     """
 
     time: float = -math.inf
     motion: Mapping[int, tuple[float, float]] = field(default_factory=dict)
     arrived: Mapping[int, float] = field(default_factory=dict)
     probability: Mapping[Pair, float] = field(default_factory=dict)
+    line: Mapping[int, FloatArray] = field(default_factory=dict)
 
     def due(self, time: float) -> bool:
         """True if it is time for another judgement."""
@@ -80,6 +88,22 @@ class RightOfWay:
         arrived = {node: then for node, then in self.arrived.items() if node not in nodes}
         probability = {pair: p for pair, p in self.probability.items() if nodes.isdisjoint(pair)}
         return replace(self, motion=motion, arrived=arrived, probability=probability)
+
+    def accelerations(
+        self, ids: IntArray, position: FloatArray, heading: FloatArray, speed: FloatArray, free: FloatArray
+    ) -> FloatArray:
+        """Expected accelerations (k,) of vehicles along their paths, m/s^2; `free` (k,): of those that do not wait."""
+        yields = dict[int, float]()
+        for (node, _), p in self.probability.items():
+            yields[node] = max(p, yields.get(node, 0.0))
+        rows = np.flatnonzero([node in yields and node in self.line for node in ids.tolist()])
+        waiting = ids[rows].tolist()
+        place = np.array([self.line[node] for node in waiting]).reshape(-1, 2)
+        left, _ = ahead_and_aside(place - position[rows], unit(heading[rows]))
+        braking = np.where(left > -PASSED, speed[rows] ** 2 / (2 * np.maximum(left, AT_LINE)), 0.0)
+        share, found = np.array([yields[node] for node in waiting]), free.copy()
+        found[rows] = (1 - share) * free[rows] - share * np.minimum(braking, HARDEST)
+        return found
 
     def yields(self, ids: IntArray) -> Yields:
         """Who yields to whom, among the tracks `ids` (n,)."""
@@ -122,7 +146,10 @@ class RightOfWay:
         acceleration = np.array([motion[node][1] for node in ids])
         columns = np.column_stack([half, speed, acceleration, to_line, halts, lead, arrival])
         pairs = [(ids[i], ids[j]) for i, j in meetings.rows.tolist()]
-        return type(self)(time, motion, arrived), pairs, _evidence(meetings, columns)
+        crossing = np.unique(meetings.rows[meetings.cosine <= ALIKE])  # those who come together do not halt
+        place = nodes.position[rows[crossing]] + to_line[crossing, None] * unit(heading[crossing])
+        line = {ids[k]: there for k, there in zip(crossing.tolist(), place, strict=True)}
+        return type(self)(time, motion, arrived, line=line), pairs, _evidence(meetings, columns)
 
     def _motion(self, ids: list[int], speed: list[float], time: float) -> dict[int, tuple[float, float]]:
         """Speed and smoothed acceleration of vehicles, by id."""

@@ -117,6 +117,30 @@ def test_what_is_known_of_a_vehicle_is_forgotten_with_it():
     assert known.probability == {}
 
 
+def braking_of(known, x, y, heading, speed, free=1.0, node=1):
+    """The expected acceleration of one vehicle, that of those that go on being `free`."""
+    place = np.array([[x, y]], dtype=float)
+    return known.accelerations(np.array([node]), place, np.array([heading]), np.array([speed]), np.array([free]))[0]
+
+
+def test_who_yields_brakes_to_its_line_and_others_go_on():
+    known = judged(waiting_in_the_south(-34.0, 8.0), lines=HALTS_IN_THE_SOUTH)
+    p = known.probability[1, 2]
+    assert known.line[1].tolist() == pytest.approx([0.0, -8.0])
+    assert braking_of(known, 0, -18, NORTH, 5.0) == pytest.approx((1 - p) * 1.0 - p * 5.0**2 / 20)
+    assert braking_of(known, 0, -8.1, NORTH, 0.0) == pytest.approx(1 - p), "it stands"
+    assert braking_of(known, 0, -8.1, NORTH, 9.0, free=0.0) == pytest.approx(-4.0 * p), "no harder than drivers brake"
+    assert braking_of(known, 0, -5, NORTH, 5.0) == pytest.approx(1 - p), "it is beyond the line"
+    assert braking_of(known, -10, 0, EAST, 8.0, node=2) == pytest.approx(1.0, abs=0.4), "it has the right of way"
+    assert braking_of(known, 0, -18, NORTH, 5.0, node=7) == 1.0, "nothing is known of it"
+
+
+def test_where_ways_come_together_nobody_halts_at_a_line():
+    traffic = memory(((-60, 0), EAST), ((-46, -8), 0.3))
+    moments = [[(-25 + 1.6 * k, 0, EAST, 8.0), (-28 + 1.6 * k, -3 + 0.1 * k, 0.06, 8.0)] for k in range(8)]
+    assert judged(moments, traffic).line == {}
+
+
 def test_paths_that_cross_a_hundred_times_meet_once():
     x = np.arange(0.0, 202.0, 0.5)
     wave = np.sin(np.pi * x / 2)
@@ -172,6 +196,36 @@ def test_a_parked_car_takes_no_part():
     pairs = tracker.snapshot().right_of_way.probability
     assert pairs
     assert not any(parked in pair for pair in pairs)
+
+
+def cars_at(time, others):
+    """Places (k, 2) of cars: three halt at a line in the south, three pass from the west meanwhile, and the fourth,
+    which comes at 18 s, is hidden from 20 s on. With `others` one passes from the west then, too."""
+    cars = [(0.0, -8.5 - 1.2 * max(4 - s, 0) ** 2 + 1.2 * max(s - 5, 0) ** 2) for s in time - 6.0 * np.arange(4)]
+    cars[3:] = cars[3:] if 18 < time < 20 else []
+    cars += [(8 * (time - 6 * n - 1.5) - 24, 0.0) for n in range(4 if others else 3)]
+    return [car for car in cars if -30 < sum(car) < 30]
+
+
+def ways_of_the_hidden_car(others):
+    """Where the car in the south is predicted, m, every 0.1 s after it is hidden."""
+    tracker, name, places = Tracker(dense_traffic_settings()), None, []
+    for k in range(1, 240):
+        cars = cars_at(0.1 * k, others)
+        heading, n = [NORTH if x == 0.0 else EAST for x, _ in cars], len(cars)
+        boxes = Boxes.of(["car"] * n, [(*car, 0.8) for car in cars], [[4.5, 1.8, 1.6]] * n, heading)
+        tracks = tracker.step(Frame(0.1 * k, "lidar", Detections(boxes, np.full(n, 0.9))))
+        if k == 199:
+            name = tracks.id[np.argmin(np.hypot(*(tracks.boxes.position[:, :2] - [0.0, -13.5]).T))]
+        places += tracks.boxes.position[tracks.id == name, 1].tolist() if name is not None else []
+    return np.array(places)
+
+
+def test_a_hidden_car_that_yields_stays_at_its_line():
+    yields, goes = ways_of_the_hidden_car(True), ways_of_the_hidden_car(False)
+    n = min(len(yields), len(goes))
+    assert n > 15
+    assert yields[n - 1] < goes[n - 1] - 3.0
 
 
 def test_a_stop_line_across_no_lane_changes_nothing():
