@@ -17,10 +17,11 @@ turn. The drivers follow and halt as those of `data_tools.simulator.road` do.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, cast, get_args
 
 import numpy as np
 
+from benchmarks.recordings.traffic import PERIOD, RecordedTraffic, Recordings
 from data_tools.simulator.road import (
     HARDEST_BRAKING,
     Drivers,
@@ -39,6 +40,7 @@ from saga_fg.numerics import BoolArray, FloatArray, IntArray, yaw_transform
 from saga_fg.types import Boxes, Scene
 
 Rule = Literal["all_way_stop", "priority_road", "cone_merge"]
+UNSEEN = 1000  # first seed of scenes that no weight is fitted to, and no setting chosen on
 STEP = 0.05  # s
 KINDS = TrafficSettings(truck_share=0.08, bus_share=0.02)
 RATE = 10.0  # 1/s, of frames
@@ -300,6 +302,20 @@ def build_crossing(rule: Rule, seed: int, duration: float = 60.0, warm_up: float
     pose = yaw_transform(*POST, 0.0, 0.0)
     both = concatenated([vehicles, marks])
     return CrossingWorld(both, Boxes.empty(), lambda time: pose, (), None, yields, traffic.meet)
+
+
+def simulated_crossings(scenes: int) -> Recordings:
+    """Vehicles without cones, as recorded traffic; the rules in turn, in scenes of seeds from `UNSEEN` on."""
+    rules = get_args(Rule)
+    names = tuple(f"{rules[k % len(rules)]}-{UNSEEN + k // len(rules)}" for k in range(scenes))
+
+    def read(name: str) -> RecordedTraffic:
+        rule, _, seed = name.rpartition("-")
+        world = build_crossing(cast(Rule, rule), int(seed))
+        vehicles = world.objects.select(np.arange(len(world.meet)))
+        return RecordedTraffic(name, vehicles).moments(slice(None, None, round(PERIOD / STEP)))
+
+    return Recordings(names, read)
 
 
 def crossing_scene(world: CrossingWorld, seed: int) -> Scene:

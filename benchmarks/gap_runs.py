@@ -19,17 +19,21 @@ Situations of hidden objects, decided by the labels alone, until each length of 
     turning            moving, and its heading changes by more than `TURN`
     at red             a vehicle that comes to a stop line within `LINE_REACH`, the first on its route, whose light was
                        last reported red or amber: it is the first at the line, or behind others
+    waiting            a vehicle whose way meets that of another one, which comes there first and in the gap; this one
+                       is slower than `SLOW` meanwhile
+    going              a vehicle that comes there first and in the gap; the other one comes within `AFTER` s
+    merging            both come there within `AFTER` s, the first of them in the gap, and go on in one direction
 
 The route is where the labels say that the object goes after the start, and straight on from the last of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -62,7 +66,10 @@ def route_of(labelled: LabelledScene, row: int, start: int) -> FloatArray | None
     return np.array([*points, points[-1] + ONWARD / length * onward]) if length > 0 else None
 
 
-SITUATIONS = ("all", "moving", "stationary", "visible leader", "free", "halting", "starting", "turning", "at red")
+SITUATIONS = (
+    *("all", "moving", "stationary", "visible leader", "free", "halting", "starting", "turning", "at red"),
+    *("waiting", "going", "merging"),
+)
 UNDER_WAY = 1.0  # m/s; an object stands below `MOVING`
 LEADER_REACH, PATH_HALF_WIDTH = 50.0, 1.6  # m
 SEEN_SHARE = 0.8  # of the moments of the gap at which a visible leader has a detection
@@ -73,6 +80,9 @@ LIGHT_REACH = 3.0  # m, from a light of the map to its report
 REPORT = "traffic_light_"
 CLOSED = ("red", "amber")
 TOUCHING = 1.0  # m: objects this close are no leaders but errors of labels
+MEETING, ALIKE = 2.0, 0.8  # m between ways that meet; cosine between courses that go on alike
+SLOW, AFTER = 2.0, 4.0  # m/s; s
+HORIZON = LONGEST + 2 * AFTER  # s, in which both come there
 
 
 def situations_of(labelled: LabelledScene, gap: Gap) -> Mapping[float, frozenset[str]]:
@@ -81,6 +91,7 @@ def situations_of(labelled: LabelledScene, gap: Gap) -> Mapping[float, frozenset
     speed = np.hypot(*labelled.velocity[:, row].T)
     always = {"all", "moving" if gap.moving else "stationary"}
     leader: int | None = None
+    met = meetings(labelled, row, start) if labelled.label[row] in ROAD_USERS else []
     if labelled.label[row] in ROAD_USERS and (route := route_of(labelled, row, start)) is not None:
         leader = leader_on(labelled, row, start, route)
         if leader is None:
@@ -100,7 +111,47 @@ def situations_of(labelled: LabelledScene, gap: Gap) -> Mapping[float, frozenset
             mine.add("starting")
         if gap.moving and abs(wrap_angle(labelled.yaw[end, row] - labelled.yaw[start, row])) > TURN:
             mine.add("turning")
+        slow = np.nanmin(speed[start : end + 1]) < SLOW
+        mine |= {name for one in met for name in one.situations(length, slow)}
         found[length] = frozenset(mine)
+    return found
+
+
+class Meeting(NamedTuple):
+    """When an object and another one first come to where their ways meet, s after the start of a gap, and whether they
+    go on alike from there."""
+
+    own: float
+    other: float
+    alike: bool
+
+    def situations(self, until: float, slow: bool) -> Iterator[str]:
+        """The situations of the object until then, which was `slow` meanwhile or not."""
+        if min(self.own, self.other) > until:
+            return
+        if self.other < self.own and slow:
+            yield "waiting"
+        if abs(self.own - self.other) <= AFTER:
+            if self.own <= self.other:
+                yield "going"
+            if self.alike:
+                yield "merging"
+
+
+def meetings(labelled: LabelledScene, row: int, start: int) -> list[Meeting]:
+    """Where the labelled way of an object from a moment on meets those of others, neither of which is there yet."""
+    time = labelled.scene.timestamps[start:] - labelled.scene.timestamps[start]
+    way = labelled.position[start : start + np.searchsorted(time, HORIZON)]
+    others, found = np.isin(labelled.label, ROAD_USERS) & np.isfinite(way[0, :, 0]), []
+    others[row] = False
+    for other in np.flatnonzero(others).tolist():
+        apart = np.linalg.norm(way[:, row, None] - way[:, other], axis=-1)
+        near = np.nan_to_num(apart, nan=np.inf) < MEETING
+        if near.any() and not near[0].any() and not near[:, 0].any():
+            own = int(near.any(axis=1).argmax())
+            at = int(near[own].argmax())
+            turned = labelled.yaw[start + own, row] - labelled.yaw[start + at, other]
+            found.append(Meeting(float(time[own]), float(time[at]), bool(np.cos(turned) > ALIKE)))
     return found
 
 

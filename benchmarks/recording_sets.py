@@ -27,7 +27,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.recordings.crossings import simulated_crossings
+from benchmarks.crossings import simulated_crossings
 from benchmarks.recordings.crowds import RATE, recorded_crowds, simulated_crowds
 from benchmarks.recordings.dut import dut_clips
 from benchmarks.recordings.ngsim import ngsim_windows
@@ -166,8 +166,8 @@ class RecordingOptions:
             "--sets",
             help="Of megvii, centerpoint, camera, kitti, simulated; either LiDAR on the camera's scene, alone and with "
             "it: megvii_alone, megvii_fused, centerpoint_alone, centerpoint_fused; confused (classes); with made "
-            "detections ngsim, openacc, dut, crossings (simulated, without signals), eth_ucy and crowds (simulated).  "
-            "[default: the first five]",
+            "detections ngsim, ngsim_without_road (no lanes, no lights), openacc, dut, crossings (simulated, without "
+            "signals), eth_ucy and crowds (simulated).  [default: the first five]",
         ),
     ] = None
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10
@@ -333,8 +333,8 @@ def recording_set(
     if name == "eth_ucy":
         return _crowded(name, recorded_crowds(data / name).middle(longest), viewpoint)
     traffic, usual = TRAFFIC_SETS[name]
-    recordings = traffic(data / name).middle(longest)
-    clusters = overlapping(map(recordings.read, recordings.names)) if name == "ngsim" else {}
+    recordings = traffic(data / name.removesuffix(WITHOUT_ROAD)).middle(longest)
+    clusters = overlapping(map(recordings.read, recordings.names)) if name.startswith("ngsim") else {}
     return _sensed(name, recordings, viewpoint or usual, clusters)
 
 
@@ -403,8 +403,10 @@ FUSION_SETS: dict[str, Callable[[Path], RecordingSet]] = {
     "centerpoint_alone": partial(_nuscenes, "centerpoint alone", "camera", _CENTERPOINT),
     "centerpoint_fused": partial(_nuscenes, "centerpoint and camera", "camera", _CENTERPOINT | _CAMERA),
 }
+WITHOUT_ROAD = "_without_road"  # of a name: neither lanes nor lights are given
 TRAFFIC_SETS: dict[str, tuple[Callable[[Path], Recordings], str]] = {
     "ngsim": (ngsim_windows, MAST),
+    "ngsim" + WITHOUT_ROAD: (partial(ngsim_windows, road="none"), MAST),
     "openacc": (openacc_platoons, VEHICLE),
     "dut": (dut_clips, MAST),
 }

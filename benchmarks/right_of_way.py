@@ -26,7 +26,7 @@ import scipy.optimize
 import scipy.special
 import typer
 
-from benchmarks.crossings import RATE, STEP, CrossingWorld, Rule, build_crossing, crossing_scene
+from benchmarks.crossings import RATE, STEP, UNSEEN, CrossingWorld, Rule, build_crossing, crossing_scene
 from benchmarks.runner import Row, Rows, chosen
 from pipelines.cli.options import Config
 from pipelines.config import TrackConfig, load_config
@@ -41,7 +41,7 @@ from saga_fg.tracking.traffic import STEP as PATH_STEP
 from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings, paths
 from saga_fg.types import Tracks
 
-FITTED, UNSEEN = 0, 1000  # first seeds: of scenes to which the weights are fitted, and of those that are judged
+FITTED = 0  # first seed of scenes to which the weights are fitted
 SETTLES = 20.0  # s, in which the tracker learns the ways of traffic: not judged
 SHORTEST, OVERLAP = 0.5, 0.2  # s
 NEAR = 2.0  # m from a vehicle to its track

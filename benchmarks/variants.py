@@ -93,6 +93,7 @@ def variants(family: str | Path) -> dict[str, Variant]:
     """All, by name, for the settings of a kind of data."""
     found = (
         *SHIPPED,
+        Variant("trails alone", changes={"tracker.edges": ()}),
         Variant("without trails", changes={"tracker.traffic.reach": 0.0}),
         Variant("class beliefs", changes={"sensors.*.confusion": CONFUSED}),
         Variant("without lights", changes={"tracker.edges": _without(RedLight, GreenLight)}),

@@ -84,13 +84,13 @@ def gap_picture(labelled: LabelledScene, gap: Gap, drawn: dict[str, JudgedRun]) 
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots(len(drawn), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for ax, (name, run) in zip(axes, drawn.items(), strict=True):
-        _draw_surroundings(ax, labelled, gap, turned)
+        draw_surroundings(ax, labelled, gap, turned, gap.stop - 1)
         seen = (shown <= gap.start) | (shown >= gap.stop)
         ax.plot(*turned(labels), ":", color="#555555", linewidth=2.0, zorder=2, label="labels, no detection")
         ax.plot(
             *turned(np.where(seen[:, None], labels, np.nan)), color="#555555", linewidth=3.0, label="labels, detected"
         )
-        _draw_tracks(ax, time, gap, shown.tolist(), run, turned)
+        draw_tracks(ax, time, gap, shown.tolist(), run, turned)
         outcome = judgement(run, gap)
         fate = "identity kept" if outcome.kept else "identity lost"
         ax.set_title(f"{name}: {fate}, mean error in the gap {outcome.error:.2f} m", loc="left", fontsize=10)
@@ -101,9 +101,9 @@ def gap_picture(labelled: LabelledScene, gap: Gap, drawn: dict[str, JudgedRun]) 
     return figure
 
 
-def _draw_surroundings(ax: Any, labelled: LabelledScene, gap: Gap, turned: Turned) -> None:
-    """Lanes, and stop lines in the colours of their lights; boxes and detections; at the last moment of the gap."""
-    k, truth = gap.stop - 1, labelled.scene.ground_truth
+def draw_surroundings(ax: Any, labelled: LabelledScene, gap: Gap, turned: Turned, k: int) -> None:
+    """Lanes, and stop lines in the colours of their lights; boxes and detections; at the moment `k`."""
+    truth = labelled.scene.ground_truth
     time = float(labelled.scene.timestamps[k])
     road, colours = colours_at(labelled, time)
     for lane in road.lanes if road is not None else ():
@@ -115,10 +115,10 @@ def _draw_surroundings(ax: Any, labelled: LabelledScene, gap: Gap, turned: Turne
             ax.fill(*turned(corners), color="#f3dcc4" if name == labelled.id[gap.row] else "#d8d8d8", zorder=1)
     nearest = int(np.argmin([abs(frame.timestamp - time) for frame in labelled.scene.frames]))
     there = labelled.boxes[nearest].position[:, :2]
-    ax.plot(*turned(there), "x", color="black", markersize=4, zorder=3, label="detections at the end")
+    ax.plot(*turned(there), "x", color="black", markersize=4, zorder=3, label="detections")
 
 
-def _draw_tracks(ax: Any, time: FloatArray, gap: Gap, shown: list[int], run: JudgedRun, turned: Turned) -> None:
+def draw_tracks(ax: Any, time: FloatArray, gap: Gap, shown: list[int], run: JudgedRun, turned: Turned) -> None:
     """The way of each track that holds the object before or after the gap, and its ellipses in the gap."""
     name_of = str(run.labelled.id[gap.row])
     holders = [found.get(name_of) for found in run.track_of]

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from birds_eye_picture import write_birds_eye_picture
 from concept_pictures import write_concept_pictures
+from crossing_picture import write_crossing_picture
 from crowd_picture import write_crowd_picture
 from gap_picture import write_gap_picture
 from heterogeneous_picture import write_heterogeneous_picture
@@ -71,6 +72,7 @@ def main() -> None:
     """All pictures; those of recordings where the variable SAGA_FG_DATA names their folder."""
     write_concept_pictures(HERE)
     write_crowd_picture(HERE / "crowd.png")
+    write_crossing_picture(HERE / "crossing.png")
     write_scaling_picture(HERE / "scaling.png")
     write_heterogeneous_picture(HERE)
     write_loops_picture(HERE)

@@ -91,6 +91,36 @@ def test_at_red_is_who_comes_to_the_line_while_it_is_closed():
     assert "at red" not in found({"a": along(5 * TIMES + 40)}, colour="red")[1.0], "it is beyond the line"
 
 
+def crosswise(y: FloatArray, x: float = 12.0) -> FloatArray:
+    return np.column_stack([np.full(len(TIMES), x), y])
+
+
+def test_who_waits_and_who_goes_is_told_by_who_comes_first_where_ways_meet():
+    halts = along(np.where(TIMES < 1.6, 5 * TIMES, np.where(TIMES < 3.0, 8.0, 8.0 + 6 * (TIMES - 3.0))))
+    passes = crosswise(8 * (TIMES - 2.4))
+    waiting = found({"a": halts, "b": passes})
+    assert "waiting" not in waiting[1.0], "the other one is there after 1.4 s"
+    assert {"waiting"} <= waiting[2.0] - {"going"}
+    assert "waiting" not in found({"a": STEADY, "b": crosswise(5 * (TIMES - 1.5))})[2.0], "it never slowed down"
+    assert "going" in found({"a": STEADY, "b": crosswise(3 * (TIMES - 4.0))})[2.0]
+    late = crosswise(np.where(TIMES < 4.8, -20.0, 100 * (TIMES - 5.0)))
+    for other in (
+        crosswise(3 * (TIMES - 4.0), x=40.0),
+        along(5 * TIMES + 12),
+        along(5 * TIMES - 12),
+        late - [0.0, 80.0],
+    ):
+        assert not found({"a": STEADY, "b": other})[2.0] & {"waiting", "going", "merging"}
+
+
+def test_merging_are_those_who_go_on_in_one_direction():
+    y = np.interp(TIMES, [0.0, 2.0, 4.5], [3.5, 3.5, 0.0])
+    joins = np.column_stack([5 * TIMES - 8, y])
+    assert {"going", "merging"} <= found({"a": STEADY, "b": joins})[2.0]
+    assert "merging" in found({"a": joins, "b": STEADY})[2.0]
+    assert "merging" not in found({"a": STEADY, "b": crosswise(3 * (TIMES - 4.0))})[2.0]
+
+
 def test_an_object_without_direction_has_no_route():
     scene = labelled({"a": along(0 * TIMES)})
     scene.yaw[:] = np.nan

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.recordings.crossings import LENGTH, LINE, RULES, simulated_crossings
+from benchmarks.crossings import simulated_crossings
 from benchmarks.recordings.ngsim import ngsim_windows
 from benchmarks.recordings.sources import Ngsim, sensed_scene, true_scene
 from benchmarks.recordings.traffic import RecordedTraffic, Recordings
@@ -181,19 +181,21 @@ def test_vehicles_stand_at_red_and_go_at_green(ngsim):
 # Simulated crossings without signals
 
 
-@pytest.mark.parametrize("row", range(len(RULES)))
+@pytest.mark.parametrize("row", range(3))
 def test_nobody_collides_and_somebody_waits(row):
-    recordings = simulated_crossings(len(RULES))
-    vehicles = recordings.read(recordings.names[row]).vehicles
+    recordings = simulated_crossings(3)
+    assert len({name.rpartition("-")[0] for name in recordings.names}) == 3, "a scene of each rule"
+    traffic = recordings.read(recordings.names[row])
+    vehicles = traffic.vehicles
+    assert np.allclose(np.diff(vehicles.time), 0.1)
+    assert vehicles.time[0] == 0
+    assert "traffic_cone" not in vehicles.label
     speed = np.hypot(*np.moveaxis(vehicles.velocity, -1, 0))
     pairs = vehicles.present[:, :, None] & vehicles.present[:, None] & ~np.eye(len(vehicles.id), dtype=bool)
     apart = np.linalg.norm(vehicles.position[:, :, None] - vehicles.position[:, None], axis=-1)
-    assert apart[pairs].min() > 0.7 * LENGTH
-    stands = (speed < 0.3) & vehicles.present
-    assert 0.02 < stands.sum() / vehicles.present.sum() < 0.7
-    major = np.abs(np.sin(vehicles.yaw)) < 0.1
-    near = np.abs(vehicles.position).max(axis=-1) < 120 - LINE + 3
-    assert (stands & near & major).any() == (RULES[row] == "all-way")
+    assert apart[pairs].min() > 1.5
+    slow = (speed < 2.0) & vehicles.present
+    assert 0.01 < slow.sum() / vehicles.present.sum() < 0.7
 
 
 # Recorded traffic through the command and the benchmarks, on a crossing written by hand
