@@ -150,7 +150,7 @@ OWN = {
 KNOWN_POSE = "known ego pose"  # no variable
 
 
-class GraphRecord:
+class EventGraph:
     """Nodes and factors, collected."""
 
     def __init__(self) -> None:
@@ -203,7 +203,7 @@ def graph_of_frame(before: TrackerView | None, now: TrackerView, start: float) -
 
     Times are counted from `start`. The states at the beginning of the interval have a joint prior, which is not listed.
     """
-    record, time, n = GraphRecord(), now.timestamp - start, len(now.table.id)
+    record, time, n = EventGraph(), now.timestamp - start, len(now.table.id)
     table, corners, numbers = now.nodes, now.boxes.corners(), dict[int, int]()
     for row, id_ in enumerate(table.id.tolist()):
         if id_ >= 0:
@@ -227,7 +227,7 @@ def graph_of_frame(before: TrackerView | None, now: TrackerView, start: float) -
 
 
 def _interactions(
-    record: GraphRecord, before: TrackerView, now: TrackerView, numbers: Mapping[int, int], start: float
+    record: EventGraph, before: TrackerView, now: TrackerView, numbers: Mapping[int, int], start: float
 ) -> None:
     """States at the beginning of the interval, the nodes of the map that act, and one interaction factor a track."""
     assert now.graph is not None

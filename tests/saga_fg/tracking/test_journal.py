@@ -20,7 +20,7 @@ from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import AssociationSettings, ClassSettings, Journal
 from saga_fg.tracking.edge_record import ACCELERATION, MAX_RATIO, EdgeRecord, HaltingPlaces
-from saga_fg.tracking.journal import GraphRecord, TrackerView
+from saga_fg.tracking.journal import EventGraph, TrackerView
 from tests.saga_fg.sampled_traffic import providers, sample_traffic
 from tests.saga_fg.traffic_frames import columns, seen
 from tests.saga_fg.traffic_frames import frame as edge_frame
@@ -229,7 +229,7 @@ def test_factors_of_users_are_in_it_under_their_names():
 
 def test_any_running_graph_is_listed_factor_for_factor():
     scene = sample_traffic(np.random.default_rng(0), frames=4, intervals=(0.5,))
-    smoother, record = IncrementalSmoother(providers(scene), lag=None), GraphRecord()
+    smoother, record = IncrementalSmoother(providers(scene), lag=None), EventGraph()
     for moment in scene.frames:
         smoother.step(moment.time)
     graph = smoother.graph()
