@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.model import (
     ConstantVelocity,
     Curvilinear,
@@ -31,6 +31,7 @@ from saga_fg.model import (
     SharedVelocity,
     Stopping,
     acting_classes,
+    checked_sensors,
     sensor_model,
 )
 from saga_fg.numerics import IntArray, checked
@@ -145,8 +146,8 @@ def track(
     parts = []
     for scene in found.scenes:
         tracker = found.new_tracker()
-        parts += [found.named(scene, tracker.step(frame).table_columns()) for frame in scene.frames]
-    return table_like(detections, parts or [Tracks.empty(0.0).table_columns()])
+        parts += [found.named(scene.name, tracker.step(frame).table_columns()) for frame in scene.frames]
+    return table_like(detections, parts or [found.named("", Tracks.empty(0.0).table_columns())])
 
 
 HORIZONS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
@@ -174,25 +175,27 @@ def predict(
     modes       a row for each mode (moving, stationary), with `probability`; otherwise their mean and covariance
 
     The table is of the same kind, with the columns of `PredictedTracks.table_columns`, and `scene` if the detections
-    have one. Warns and raises as `track`, and for a time that is in no scene.
+    have one. Warns and raises as `track`, and for a time that is in no scene, or from which a horizon is more than 60 s
+    after the last frame before it.
     """
     how = TableImport(columns or {}, classes or {}, units or {}, coordinates, as_given=as_given)
     ahead, wanted = checked_horizons(horizons), None if times is None else np.sort(checked("times", times, (None,)))
     found = read_scenes(detections, how, settings, sensors, "")
-    spans = [(scene.frames[0].timestamp, scene.frames[-1].timestamp) for scene in found.scenes]
+    stamps = [found.stamps(scene) for scene in found.scenes]
+    spans = [(each[0], max(each)) for each in stamps]
     for time in [] if wanted is None else wanted.tolist():
         if not any(first <= time <= last for first, last in spans):
             within = ", ".join(f"{first:.10g} to {last:.10g}" for first, last in spans[:6])
             raise InputError(f"times: expected seconds within a scene ({within}), got {time:.10g}")
     parts = []
-    for scene, (first, last) in zip(found.scenes, spans, strict=True):
-        tracker, frames = found.new_tracker(), deque(scene.frames)
+    for scene, of_scene, (first, last) in zip(found.scenes, stamps, spans, strict=True):
+        tracker, frames = found.new_tracker(), deque(zip(of_scene, scene.frames, strict=True))
         here = np.array([last]) if wanted is None else wanted[(wanted >= first) & (wanted <= last)]
         for time in here.tolist():
-            while frames and frames[0].timestamp <= time:
-                tracker.step(frames.popleft())
-            parts.append(found.named(scene, tracker.predict(ahead, since=time).table_columns(modes)))
-    return table_like(detections, parts or [PredictedTracks.empty(0.0, ahead).table_columns(modes)])
+            while frames and frames[0][0] <= time:
+                tracker.step(frames.popleft()[1])
+            parts.append(found.named(scene.name, tracker.predict(ahead, since=time).table_columns(modes)))
+    return table_like(detections, parts or [found.named("", PredictedTracks.empty(0.0, ahead).table_columns(modes))])
 
 
 class TableScenes(NamedTuple):
@@ -207,9 +210,13 @@ class TableScenes(NamedTuple):
         """Return a tracker for one of them."""
         return Tracker(self.settings, self.sensors)
 
-    def named(self, scene: Scene, columns: Mapping[str, Any]) -> dict[str, Any]:
+    def stamps(self, scene: Scene) -> list[float]:
+        """Return the times of the frames of a scene by the clock of its tracks, s: with the offsets of sensors."""
+        return [frame.timestamp + sensor_model(self.sensors, frame.sensor).time_offset for frame in scene.frames]
+
+    def named(self, scene: str, columns: Mapping[str, Any]) -> dict[str, Any]:
         """Columns of a table about a scene, with its name where scenes have one."""
-        name = {"scene": np.full(len(columns["id"]), scene.name)} if self.is_named else {}
+        name = {"scene": np.full(len(columns["id"]), scene)} if self.is_named else {}
         return name | dict(columns)
 
 
@@ -224,6 +231,9 @@ def read_scenes(
 
     Warns of those for dense traffic and of what is doubtful, at the caller's caller; raises as `tell`.
     """
+    if settings is not None:
+        require_type("settings", settings, TrackerSettings)
+    sensors = UNKNOWN_SENSORS if sensors is None else checked_sensors(sensors)
     raw = raw_table(detections, how, within=within)
     scenes = scenes_of(raw)
     why = seems_dense_traffic(scenes[0].frames) if scenes and settings is None else ""
@@ -232,7 +242,6 @@ def read_scenes(
         warnings.warn(f"settings for dense traffic: {why}; {plain}", stacklevel=3)
     if settings is None:
         settings = dense_traffic_settings() if why else TrackerSettings(min_hits=2)
-    sensors = UNKNOWN_SENSORS if sensors is None else sensors
     frames = [frame for scene in scenes for frame in scene.frames]
     labels = {name for frame in frames for name in frame.detections.boxes.label.tolist()}
     logits = any(sensor_model(sensors, name).score == "logit" for name in {frame.sensor for frame in frames})

@@ -46,7 +46,7 @@ from saga_fg.tracking.update import (
     update_existence,
     update_tracks,
 )
-from saga_fg.types import LATEST, Frame, PredictedTracks, Tracks, checked_horizons, finite_seconds
+from saga_fg.types import LATEST, LONGEST_PREDICTION, Frame, PredictedTracks, Tracks, checked_horizons, finite_seconds
 
 log = logging.getLogger(__name__)
 
@@ -263,7 +263,12 @@ class Tracker:
         if newest == -math.inf:
             raise InputError("predict: expected a frame before, there is no time to predict from")
         since = newest if since is None else finite_seconds(since)
-        found = look_ahead(self._state.copied(), checked_horizons(checked + (since - newest)), joint)
+        ahead = checked + (since - newest)
+        if ahead[0] < 0 or ahead[-1] > LONGEST_PREDICTION:
+            got = f"{since + checked[0]:.10g} to {since + checked[-1]:.10g}"
+            within = f"from the newest frame, at {newest:.10g} s, to {LONGEST_PREDICTION:g} s later"
+            raise InputError(f"predict: expected times {within}, got {got}")
+        found = look_ahead(self._state.copied(), ahead, joint)
         return replace(found, timestamp=since, horizons=checked)
 
     def snapshot(self) -> TrackerSnapshot:

@@ -91,6 +91,19 @@ def test_the_tracks_are_those_of_track():
     assert default.horizon.unique().tolist() == [0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
 
 
+@pytest.mark.parametrize("offset", [-0.04, 0.04])
+def test_times_are_those_of_tracks_whatever_the_offset_of_the_sensor(offset):
+    arguments = {"settings": PLAIN, "sensors": {"default": Sensor(time_offset=offset)}}
+    tracks = saga_fg.track(traffic(2.0), **arguments)
+    found = saga_fg.predict(traffic(2.0), [0.0], tracks.timestamp.unique()[-3:], **arguments)
+    same = tracks[tracks.timestamp.isin(found.timestamp)]
+    assert found.timestamp.nunique() == 3
+    assert found[["timestamp", "id"]].to_numpy().tolist() == same[["timestamp", "id"]].to_numpy().tolist()
+    assert found.x.to_numpy() == pytest.approx(same.x.to_numpy())
+    latest = saga_fg.predict(traffic(2.0), [0.0], **arguments)
+    pd.testing.assert_frame_equal(latest, found[found.timestamp == found.timestamp.max()].reset_index(drop=True))
+
+
 def test_modes_have_the_mean_and_covariance_of_their_mixture():
     settings = TrackerSettings(edges=(), stationary_share=0.5)
     rows = pd.DataFrame({"timestamp": np.repeat(np.arange(8) / 5, 2), "x": 0.0, "y": [0.0, 9.0] * 8})
@@ -156,5 +169,15 @@ def test_what_cannot_be_predicted_is_named(subtests):
     none = saga_fg.predict(rows[:0], modes=True)
     assert len(none) == 0
     assert {"mode", "probability", "horizon", "cov_xx"} <= set(none.columns)
+    for nothing in (saga_fg.predict(rows.assign(scene="a"), times=[]), saga_fg.track(rows[:0].assign(scene="a"))):
+        assert (len(nothing), nothing.columns[0]) == (0, "scene")
+    gap = pd.concat([rows, rows.assign(timestamp=rows.timestamp + 90)])
+    late = "predict: expected times from the newest frame, at 0.9 s, to 60 s later, got 80.5 to 83"
+    with pytest.raises(InputError, match=re.escape(late)):
+        saga_fg.predict(gap, times=[80.0], settings=PLAIN)
+    with pytest.raises(InputError, match="settings: expected TrackerSettings, got dict"):
+        saga_fg.predict(rows, settings={"min_hits": 2})
+    with pytest.raises(InputError, match=re.escape("sensors.lidar: expected Sensor, got float")):
+        saga_fg.track(rows, sensors={"lidar": 0.2})
     with pytest.raises(InputError, match=re.escape("times: expected seconds within a scene (), got 1")):
         saga_fg.predict(rows[:0], times=[1.0])
