@@ -87,7 +87,8 @@ class RightOfWay:
         motion = {node: one for node, one in self.motion.items() if node not in nodes}
         arrived = {node: then for node, then in self.arrived.items() if node not in nodes}
         probability = {pair: p for pair, p in self.probability.items() if nodes.isdisjoint(pair)}
-        return replace(self, motion=motion, arrived=arrived, probability=probability)
+        line = {node: place for node, place in self.line.items() if node not in nodes}
+        return replace(self, motion=motion, arrived=arrived, probability=probability, line=line)
 
     def accelerations(
         self, ids: IntArray, position: FloatArray, heading: FloatArray, speed: FloatArray, free: FloatArray

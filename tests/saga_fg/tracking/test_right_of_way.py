@@ -74,6 +74,13 @@ def test_who_waits_where_traffic_halts_yields_to_who_comes():
     assert all(0.0 <= p <= 1.0 for p in known.probability.values())
 
 
+def test_nothing_is_kept_of_a_vehicle_that_is_someone_else():
+    known = judged(waiting_in_the_south(-34.0, 8.0), lines=HALTS_IN_THE_SOUTH)
+    left = known.without({1})
+    assert 1 in known.line
+    assert not any(1 in kept for kept in (left.motion, left.arrived, left.line, *left.probability))
+
+
 def test_nobody_yields_to_who_has_left():
     assert told(judged(waiting_in_the_south(20.0, 8.0), lines=HALTS_IN_THE_SOUTH)) == set()
 
