@@ -104,7 +104,7 @@ def decoder(type_: str, text: str | None = None) -> Callable[[bytes], Any]:
     store, name = known_types(), _full(plain_type(type_))
     if text is not None:
         store = get_typestore(Stores.EMPTY)
-        store.register(get_types_from_msg(text, name))
+        store.register(get_types_from_msg(text.replace("\r\n", "\n"), name))
     return partial(store.deserialize_cdr, typename=name)
 
 

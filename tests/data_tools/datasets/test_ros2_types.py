@@ -112,6 +112,14 @@ def test_fields_are_those_of_ros():
         assert known_types().fielddefs[name][1] == example.typestore().fielddefs[name][1]
 
 
+def test_definitions_may_have_the_line_ends_of_another_system():
+    message = ros_message("std_msgs/Header", ros_message("builtin_interfaces/Time", 1, 2), "map")
+    data = encoded("std_msgs/Header", message)
+    text = definition("std_msgs/Header").replace("\n", "\r\n")
+    found = decoder("std_msgs/Header", text)(data)
+    assert (found.stamp.sec, found.stamp.nanosec, found.frame_id) == (1, 2, "map")
+
+
 def test_a_field_that_is_missing_is_named():
     with pytest.raises(TypeError, match="frame_id"):
         ros_message("std_msgs/Header", ros_message("builtin_interfaces/Time", 1, 2))
