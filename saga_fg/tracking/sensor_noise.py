@@ -109,7 +109,7 @@ class SensorNoise:
         """(n,) s of detections of these classes (n,) at these distances (n,) from the sensor, m."""
         occurring, index = distinct(label)
         a, g = np.array([self.growing.get(each, (self.scale, 0.0)) for each in occurring]).reshape(-1, 2)[index].T
-        return np.asarray(np.hypot(a, g * distance))
+        return np.asarray(np.clip(np.hypot(a, g * distance), LEAST, MOST))
 
 
 UNMEASURED = SensorNoise()

@@ -67,6 +67,9 @@ def test_noise_is_found_by_class_and_range():
     rare = noise.scales(np.array(["van"]), np.array([40.0]))
     assert rare == pytest.approx([noise.scale])
     assert found.min() < noise.scale < found.max()
+    beyond = noise.scales(np.array(["car", "car"]), np.array([0.0, 900.0]))
+    assert beyond.min() >= LEAST
+    assert beyond.max() == pytest.approx(MOST)
 
 
 def frames(sigma, count=80, seed=0, **columns):
