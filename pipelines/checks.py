@@ -31,7 +31,7 @@ class Checks:
     settings    of the run
     usual       the shipped settings: what a file for --config adds to them should meet something in the data
     option_for  the options of the command that mend a suspicion, "" for none
-    live_plain  whether live frames that look like dense traffic are told, as --like is left out
+    live_plain  whether live frames that look like dense traffic are told, as --like and --config are left out
     """
 
     def __init__(

@@ -307,3 +307,15 @@ def test_settings_for_dense_traffic_are_those_of_track_and_a_file_lies_over_them
             answer = json.loads(line)["tracks"]
             assert [track["id"] for track in answer] == tracks.id.tolist()
             assert [track["vx"] for track in answer] == pytest.approx(tracks.boxes.velocity[:, 0], abs=1e-3)
+
+
+def test_a_file_of_settings_decides_about_dense_traffic(tmp_path):
+    cars: Any = [
+        [{"label": "car", "x": k - 12 * n, "y": 4 * (n % 2), "yaw": 0.0} for n in range(6)] for k in range(115)
+    ]
+    frames = [{"timestamp": k / 10, "detections": each} for k, each in enumerate(cars)]
+    stream, config = "\n".join(map(json.dumps, frames)).encode(), tmp_path / "c.yaml"
+    config.write_text("tracker: {min_hits: 2}\n")
+    for options, told in (((), True), (("--config", str(config)), False)):
+        served = subprocess.run([*COMMAND, "serve", *options], input=stream, capture_output=True, check=True)
+        assert ("add --like dense" in served.stderr.decode()) == told
