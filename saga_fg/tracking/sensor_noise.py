@@ -109,7 +109,7 @@ class SensorNoise:
         """(n,) s of detections of these classes (n,) at these distances (n,) from the sensor, m."""
         occurring, index = distinct(label)
         a, g = np.array([self.growing.get(each, (self.scale, 0.0)) for each in occurring]).reshape(-1, 2)[index].T
-        return np.asarray(np.clip(np.hypot(a, g * distance), LEAST, MOST))
+        return np.asarray(np.minimum(np.hypot(a, g * distance), MOST))
 
 
 UNMEASURED = SensorNoise()
@@ -148,14 +148,14 @@ def _scale(parts: Sequence[_Squares], whole: float, prior: float) -> float:
 
 
 def _growing(squares: Mapping[tuple[str, int], _Squares], whole: float) -> dict[str, tuple[float, float]]:
-    """(a, g) by class, closest to the s of its bands."""
+    """(a, g) by class, closest to the s of its bands, with a from `LEAST` on."""
     found = {}
     for label in sorted({label for label, _ in squares}):
         bands = {band: each for (of, band), each in squares.items() if of == label}
         s = _scale(list(bands.values()), whole, OF_GROUP)
         by_band = [_scale([bands[k]], s, OF_GROUP) if k in bands else s for k in range(len(MIDDLES))]
-        a2, g2 = nnls(np.column_stack([np.ones(len(MIDDLES)), MIDDLES**2]), np.square(by_band))[0]
-        found[label] = math.sqrt(a2), math.sqrt(g2)
+        above, g2 = nnls(np.column_stack([np.ones(len(MIDDLES)), MIDDLES**2]), np.square(by_band) - LEAST**2)[0]
+        found[label] = math.sqrt(LEAST**2 + above), math.sqrt(g2)
     return found
 
 

@@ -67,9 +67,20 @@ def test_noise_is_found_by_class_and_range():
     rare = noise.scales(np.array(["van"]), np.array([40.0]))
     assert rare == pytest.approx([noise.scale])
     assert found.min() < noise.scale < found.max()
-    beyond = noise.scales(np.array(["car", "car"]), np.array([0.0, 900.0]))
-    assert beyond.min() >= LEAST
-    assert beyond.max() == pytest.approx(MOST)
+
+
+def test_noise_that_grows_fast_stays_within_its_bounds_at_all_ranges():
+    rng, noise = np.random.default_rng(6), SensorNoise()
+    distance = np.repeat([8.0, 26.0, 55.0], 8)
+    sigma = np.maximum(0.08, 4e-4 * distance**2)
+    start = rng.uniform(-50, 50, (len(distance), 2))
+    for k in range(95):
+        noise = taken(noise, 0.1 * k, start + rng.normal(0, sigma[:, None], start.shape), "car", distance)
+    near, _, far = noise.scales(np.resize("car", 3), np.array([0.0, 40.0, 900.0]))
+    assert LEAST <= near < noise.scale < far == pytest.approx(MOST)
+    model = scaled_sensors({}, {"table": noise})["table"].noise["car"]
+    assert model.position == pytest.approx(near * Sensor().noise["default"].position)
+    assert model.range_noise == model.bearing_noise > 0
 
 
 def frames(sigma, count=80, seed=0, **columns):
