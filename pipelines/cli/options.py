@@ -409,9 +409,12 @@ def _examples(verb: Verb, source: Source, examples: tuple[str, ...]) -> str:
     recordings = f"{source.name} {options}"
     result = "labels" if verb == "evaluate labels" else source.written.tracks_example
     beside = f"{source.name} {result} {''.join(arguments)}{options}"
+    if verb == "evaluate":
+        recordings = f"{source.name} {''.join(arguments)}{options}"
     if verb in ("evaluate", "evaluate labels") and source.truth_option:
-        recordings = f"{source.name} {''.join(arguments)}{options} {source.truth_option} truth.csv"
-        beside = f"{source.name} {result} {source.truth_option} truth.csv"
+        truth = f" {source.truth_option} truth.csv"
+        recordings += truth
+        beside = f"{source.name} {result}{truth}" if verb == "evaluate" else beside + truth
     lines = []
     for example in examples:
         line = "  saga-fg " + example.format(recordings=recordings, result=beside, name=source.name, tracks=result)

@@ -28,7 +28,7 @@ from tests.pipelines.command import COMMAND, done, refused, saga_fg
 from tests.pipelines.scale_out_example import write_recordings
 
 
-def commands(group: Any, path: str = "") -> Iterator[str]:
+def commands(group: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """All commands by their full names: `track nuscenes`, ..."""
     context = Context(group)
     for name in group.list_commands(context):
@@ -36,16 +36,25 @@ def commands(group: Any, path: str = "") -> Iterator[str]:
         if hasattr(command, "list_commands"):
             yield from commands(command, f"{path}{name} ")
         else:
-            yield f"{path}{name}"
+            yield f"{path}{name}", command
 
 
 def test_help_and_version():
-    for command in list(commands(get_command(app))):
+    for command, _ in commands(get_command(app)):
         result = done(*command.split(), "--help")
         assert f"    saga-fg {command}" in result.stdout
         assert "Example" in result.stdout
     result = done("--version")
     assert result.stdout.startswith("saga-fg 0.")
+
+
+def test_examples_have_the_options_that_their_commands_require():
+    for name, command in commands(get_command(app)):
+        options = [each.opts[0] for each in command.params if each.required and each.param_type_name == "option"]
+        lines = command.help.replace("\\\n", " ").splitlines()
+        examples = [line.split() for line in lines if f"saga-fg {name} " in line]
+        for option in options:
+            assert all(option in example for example in examples), f"{name}: {option}"
 
 
 def test_config_prints_yaml_that_leads_to_itself(tmp_path):
