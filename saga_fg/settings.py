@@ -84,7 +84,7 @@ class Settings:
                 if isinstance(allowed, Range) and not (isinstance(value, Real) and float(value) in allowed):
                     raise InputError(f"{where}: expected a {allowed}, got {value!r}")
                 if isinstance(allowed, tuple) and value not in allowed:
-                    raise InputError(f"{where}: expected one of {', '.join(allowed)}, got {value!r}")
+                    raise InputError(f"{where}: expected one of {', '.join(filter(None, allowed))}, got {value!r}")
             if isinstance(allowed, Range) and allowed.ascending and list(given) != sorted(given):
                 raise InputError(f"{name}: expected ascending numbers, got {given!r}")
 

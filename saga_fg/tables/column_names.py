@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.numerics import FloatArray
 from saga_fg.settings import Settings, setting, settings_group
 from saga_fg.types import FILL_IN, Finding, Mend
@@ -358,6 +358,8 @@ class TableImport(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for option in ("columns", "classes", "units"):
+            require_type(option, getattr(self, option), Mapping)
         columns = {}
         for name, column in self.columns.items():
             ours = canonical(name)

@@ -161,6 +161,8 @@ def test_what_cannot_be_predicted_is_named(subtests):
         ({"times": [np.nan]}, "times[0]: expected a finite number, got nan"),
         ({"columns": {"x": "east"}}, "east"),
         ({"units": {"angle": "turns"}}, "turns"),
+        ({"columns": ["x"]}, "columns: expected Mapping, got list"),
+        ({"coordinates": "map"}, "coordinates: expected one of world, ego, sensor, camera, got 'map'"),
     ]:
         with subtests.test(message), pytest.raises(InputError, match=re.escape(message)):
             saga_fg.predict(rows, **arguments)
