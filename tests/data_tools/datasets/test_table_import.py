@@ -247,7 +247,7 @@ def test_ways_of_reading_that_do_not_exist(subtests):
         ({"columns": {"lenghth": "l"}}, "columns.lenghth: unknown column, did you mean 'length'?"),
         ({"units": {"time": "minutes"}}, "time: expected one of s, ms, us, ns, iso8601"),
         ({"units": {"weight": "kg"}}, "units.weight: expected one of time, length"),
-        ({"coordinates": "map"}, "coordinates: expected one of , world, ego, sensor, camera, got 'map'"),
+        ({"coordinates": "map"}, "coordinates: expected one of world, ego, sensor, camera, got 'map'"),
     ]:
         with subtests.test(message), pytest.raises(InputError, match=message.replace("?", r"\?")):
             TableImport(**values)
