@@ -69,14 +69,14 @@ class RightOfWay:
     motion       speed, m/s, and acceleration, m/s^2, of vehicles, by id
     arrived      when they have arrived, s, by id
     probability  that the first of two yields to the second, by ids
-    line         place (2,), local, m, at which vehicles would wait for those whose paths cross theirs, by id
+    line         place (2,), local, m, at which the first would wait for the second, by ids of those whose paths cross
     """
 
     time: float = -math.inf
     motion: Mapping[int, tuple[float, float]] = field(default_factory=dict)
     arrived: Mapping[int, float] = field(default_factory=dict)
     probability: Mapping[Pair, float] = field(default_factory=dict)
-    line: Mapping[int, FloatArray] = field(default_factory=dict)
+    line: Mapping[Pair, FloatArray] = field(default_factory=dict)
 
     def due(self, time: float) -> bool:
         """True if it is time for another judgement."""
@@ -87,22 +87,23 @@ class RightOfWay:
         motion = {node: one for node, one in self.motion.items() if node not in nodes}
         arrived = {node: then for node, then in self.arrived.items() if node not in nodes}
         probability = {pair: p for pair, p in self.probability.items() if nodes.isdisjoint(pair)}
-        line = {node: place for node, place in self.line.items() if node not in nodes}
+        line = {pair: place for pair, place in self.line.items() if nodes.isdisjoint(pair)}
         return replace(self, motion=motion, arrived=arrived, probability=probability, line=line)
 
     def accelerations(
         self, ids: IntArray, position: FloatArray, heading: FloatArray, speed: FloatArray, free: FloatArray
     ) -> FloatArray:
         """Expected accelerations (k,) of vehicles along their paths, m/s^2; `free` (k,): of those that do not wait."""
-        yields = dict[int, float]()
-        for (node, _), p in self.probability.items():
-            yields[node] = max(p, yields.get(node, 0.0))
-        rows = np.flatnonzero([node in yields and node in self.line for node in ids.tolist()])
-        waiting = ids[rows].tolist()
-        place = np.array([self.line[node] for node in waiting]).reshape(-1, 2)
-        left, _ = ahead_and_aside(place - position[rows], unit(heading[rows]))
+        waiting = dict[int, tuple[float, FloatArray]]()
+        for pair, place in self.line.items():
+            if (p := self.probability.get(pair, 0.0)) > waiting.get(pair[0], (0.0,))[0]:
+                waiting[pair[0]] = p, place
+        rows = np.flatnonzero([node in waiting for node in ids.tolist()])
+        known = [waiting[node] for node in ids[rows].tolist()]
+        share, places = np.array([p for p, _ in known]), np.array([place for _, place in known]).reshape(-1, 2)
+        left, _ = ahead_and_aside(places - position[rows], unit(heading[rows]))
         braking = np.where(left > -PASSED, speed[rows] ** 2 / (2 * np.maximum(left, AT_LINE)), 0.0)
-        share, found = np.array([yields[node] for node in waiting]), free.copy()
+        found = free.copy()
         found[rows] = (1 - share) * free[rows] - share * np.minimum(braking, HARDEST)
         return found
 
@@ -147,9 +148,10 @@ class RightOfWay:
         acceleration = np.array([motion[node][1] for node in ids])
         columns = np.column_stack([half, speed, acceleration, to_line, halts, lead, arrival])
         pairs = [(ids[i], ids[j]) for i, j in meetings.rows.tolist()]
-        crossing = np.unique(meetings.rows[meetings.cosine <= ALIKE])  # those who come together do not halt
-        place = nodes.position[rows[crossing]] + to_line[crossing, None] * unit(heading[crossing])
-        line = {ids[k]: there for k, there in zip(crossing.tolist(), place, strict=True)}
+        crossing = np.flatnonzero(meetings.cosine <= ALIKE)  # those who come together do not halt
+        waits = meetings.rows[crossing, 0]
+        place = nodes.position[rows[waits]] + to_line[waits, None] * unit(heading[waits])
+        line = {pairs[k]: there for k, there in zip(crossing.tolist(), place, strict=True)}
         return type(self)(time, motion, arrived, line=line), pairs, _evidence(meetings, columns)
 
     def _motion(self, ids: list[int], speed: list[float], time: float) -> dict[int, tuple[float, float]]:

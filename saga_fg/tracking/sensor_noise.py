@@ -153,6 +153,9 @@ def _growing(squares: Mapping[tuple[str, int], _Squares], whole: float) -> dict[
     for label in sorted({label for label, _ in squares}):
         bands = {band: each for (of, band), each in squares.items() if of == label}
         s = _scale(list(bands.values()), whole, OF_GROUP)
+        if len(bands) == 1:  # all near, or at unknown distances
+            found[label] = s, 0.0
+            continue
         by_band = [_scale([bands[k]], s, OF_GROUP) if k in bands else s for k in range(len(MIDDLES))]
         above, g2 = nnls(np.column_stack([np.ones(len(MIDDLES)), MIDDLES**2]), np.square(by_band) - LEAST**2)[0]
         found[label] = math.sqrt(LEAST**2 + above), math.sqrt(g2)

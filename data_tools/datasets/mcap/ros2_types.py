@@ -7,7 +7,7 @@ Sources: vision_msgs 4 (https://github.com/ros-perception/vision_msgs), autoware
 (https://github.com/autowarefoundation/autoware_msgs).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache, partial
 from typing import Any
 
@@ -97,15 +97,32 @@ def fields_of(type_: str) -> Iterator[tuple[str, str, int | None]]:
         yield name, plain_type(of if isinstance(of, str) else of[0]), kind[1] if many else None
 
 
+MAX_FIXED = 1000  # entries that are no numbers, of an array of fixed length: rosbags makes code of each
+
+
 def decoder(type_: str, text: str | None = None) -> Callable[[bytes], Any]:
-    """The function that decodes messages of a type by this definition (None: the known one); it raises what it will."""
+    """The function that decodes messages of a type by this definition (None: the known one); it raises what it will.
+
+    Raises `InputError` for a definition with an array of more than `MAX_FIXED` texts or messages.
+    """
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store, name = known_types(), _full(plain_type(type_))
     if text is not None:
         store = get_typestore(Stores.EMPTY)
-        store.register(get_types_from_msg(text.replace("\r\n", "\n"), name))
+        types = get_types_from_msg(text.replace("\r\n", "\n"), name)
+        for _, fields in types.values():
+            _check_lengths(fields)
+        store.register(types)
     return partial(store.deserialize_cdr, typename=name)
+
+
+def _check_lengths(fields: Iterable[tuple[str, Any]]) -> None:
+    for name, (_, kind) in fields:
+        if isinstance(kind[0], tuple) and kind[1] > MAX_FIXED:
+            of = kind[0][1] if isinstance(kind[0][1], str) else kind[0][1][0]
+            if of in ("string", "wstring") or "/" in of:
+                raise InputError(f"{name}: expected a fixed length of at most {MAX_FIXED} of {of}, got {kind[1]}")
 
 
 def encoded(type_: str, message: Any) -> bytes:

@@ -120,6 +120,13 @@ def test_definitions_may_have_the_line_ends_of_another_system():
     assert (found.stamp.sec, found.stamp.nanosec, found.frame_id) == (1, 2, "map")
 
 
+@pytest.mark.parametrize("fixed", ["string[100000] x", "C[5000] x\n" + 80 * "=" + "\nMSG: a/C\nint32 y"])
+def test_long_arrays_of_fixed_length_are_refused(fixed):
+    with pytest.raises(InputError, match="x: expected a fixed length of at most 1000"):
+        decoder("a/B", fixed)
+    assert len(decoder("a/B", "float64[100000] x")(bytes(4 + 8 * 100000)).x) == 100000
+
+
 def test_a_field_that_is_missing_is_named():
     with pytest.raises(TypeError, match="frame_id"):
         ros_message("std_msgs/Header", ros_message("builtin_interfaces/Time", 1, 2))

@@ -1,5 +1,7 @@
 """Who yields to whom, from paths of earlier traffic, places of halts, order of arrival and what vehicles do."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -77,8 +79,8 @@ def test_who_waits_where_traffic_halts_yields_to_who_comes():
 def test_nothing_is_kept_of_a_vehicle_that_is_someone_else():
     known = judged(waiting_in_the_south(-34.0, 8.0), lines=HALTS_IN_THE_SOUTH)
     left = known.without({1})
-    assert 1 in known.line
-    assert not any(1 in kept for kept in (left.motion, left.arrived, left.line, *left.probability))
+    assert any(1 in pair for pair in known.line)
+    assert not any(1 in kept for kept in (left.motion, left.arrived, *left.line, *left.probability))
 
 
 def test_nobody_yields_to_who_has_left():
@@ -133,13 +135,15 @@ def braking_of(known, x, y, heading, speed, free=1.0, node=1):
 def test_who_yields_brakes_to_its_line_and_others_go_on():
     known = judged(waiting_in_the_south(-34.0, 8.0), lines=HALTS_IN_THE_SOUTH)
     p = known.probability[1, 2]
-    assert known.line[1].tolist() == pytest.approx([0.0, -8.0])
+    assert known.line[1, 2].tolist() == pytest.approx([0.0, -8.0])
     assert braking_of(known, 0, -18, NORTH, 5.0) == pytest.approx((1 - p) * 1.0 - p * 5.0**2 / 20)
     assert braking_of(known, 0, -8.1, NORTH, 0.0) == pytest.approx(1 - p), "it stands"
     assert braking_of(known, 0, -8.1, NORTH, 9.0, free=0.0) == pytest.approx(-4.0 * p), "no harder than drivers brake"
     assert braking_of(known, 0, -5, NORTH, 5.0) == pytest.approx(1 - p), "it is beyond the line"
     assert braking_of(known, -10, 0, EAST, 8.0, node=2) == pytest.approx(1.0, abs=0.4), "it has the right of way"
     assert braking_of(known, 0, -18, NORTH, 5.0, node=7) == 1.0, "nothing is known of it"
+    joining = replace(known, probability={**known.probability, (2, 7): 0.99})
+    assert braking_of(joining, -10, 0, EAST, 8.0, node=2) == braking_of(known, -10, 0, EAST, 8.0, node=2), "no line"
 
 
 def test_where_ways_come_together_nobody_halts_at_a_line():
