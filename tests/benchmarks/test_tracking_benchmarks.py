@@ -91,9 +91,12 @@ def test_the_command_refuses(refused, subtests):
         ("--against turn --contenders saga,kf", "--against: unknown name"),
         (
             "--viewpoint mast",
-            "--viewpoint: expected ngsim or openacc or dut or eth_ucy or crowds or crossings among --sets",
+            "--viewpoint: expected ngsim or ngsim_without_road or openacc or dut or eth_ucy or crowds or crossings among --sets",
         ),
-        ("--longest 20", "--longest: expected ngsim or openacc or dut or eth_ucy or crowds or crossings among --sets"),
+        (
+            "--longest 20",
+            "--longest: expected ngsim or ngsim_without_road or openacc or dut or eth_ucy or crowds or crossings among --sets",
+        ),
         ("--test scene-0099", "--test: unknown name"),
         ("--of halting,red", "--of: unknown name 'red'"),
         ("--lengths 4", "--lengths: unknown name '4'"),
