@@ -83,20 +83,17 @@ def test_the_command_compares_on_the_same_gaps(bench, tmp_path):
     assert everything["gaps"] + everything["lost"] == sum(row["gaps"] for row in counts)
 
 
+MADE = "ngsim or ngsim_without_road or openacc or dut or eth_ucy or crowds or crossings"
+
+
 @pytest.mark.usefixtures("short_scenes")
 def test_the_command_refuses(refused, subtests):
     for arguments, message in [
         ("--contenders nobody", "--contenders: unknown name"),
         ("--contender own", "expected a new NAME=FILE"),
         ("--against turn --contenders saga,kf", "--against: unknown name"),
-        (
-            "--viewpoint mast",
-            "--viewpoint: expected ngsim or ngsim_without_road or openacc or dut or eth_ucy or crowds or crossings among --sets",
-        ),
-        (
-            "--longest 20",
-            "--longest: expected ngsim or ngsim_without_road or openacc or dut or eth_ucy or crowds or crossings among --sets",
-        ),
+        ("--viewpoint mast", f"--viewpoint: expected {MADE} among --sets"),
+        ("--longest 20", f"--longest: expected {MADE} among --sets"),
         ("--test scene-0099", "--test: unknown name"),
         ("--of halting,red", "--of: unknown name 'red'"),
         ("--lengths 4", "--lengths: unknown name '4'"),
