@@ -30,9 +30,8 @@ class Comparison:
     metrics: dict[Method, SceneMetrics]
 
     def milliseconds_per_frame(self, method: Method) -> float:
-        """Mean time the tracker took for one frame."""
-        runs = self.runs[method]
-        return 1000 * sum(run.seconds for run in runs) / max(sum(run.frames for run in runs), 1)
+        """Median of the time the tracker took for a frame: the first ones may compile kernels."""
+        return float(np.median([time for run in self.runs[method] for time in run.milliseconds] or [0.0]))
 
 
 def compare(
