@@ -212,7 +212,7 @@ def match_to_truth(scene: Scene, sensors: Mapping[str, Sensor], gate: float = GA
     confused = ConfusedClasses.of(sensors, {})
     for frame in scene.frames:
         sensor = sensor_model(sensors, frame.sensor)
-        time = frame.timestamp + sensor.time_offset
+        time = sensor.measured_at(frame)
         k = int(np.searchsorted(scene.timestamps, time - 1e-6))
         if k >= len(scene) or (k == 0 and time < scene.timestamps[0] - 1e-6):
             continue
@@ -252,7 +252,7 @@ def measured_trajectories(
         objects: dict[tuple[str, str], list[tuple[float, FloatArray, FloatArray, float, float]]] = {}
         for matched in match_to_truth(scene, sensors, REACH):
             truth, sensor = matched.annotations, sensor_model(sensors, matched.frame.sensor)
-            time = matched.frame.timestamp + sensor.time_offset
+            time = sensor.measured_at(matched.frame)
             boxes = matched.detections.boxes
             R = sensor.detection_covariance(matched.detections, matched.origin)[:, :2, :2]
             (yaw_noise,) = sensor.deviations(boxes.label, "yaw")

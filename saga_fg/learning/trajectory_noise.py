@@ -121,7 +121,7 @@ def sample_with_tracker(
 def _linked(frame: Frame, sensor: Sensor, assignment: Assignment) -> _Linked:
     track = np.full(len(frame), -1, dtype=np.int64)
     track[assignment.detection] = assignment.id
-    return _Linked(frame, sensor, frame.timestamp + sensor.time_offset, sensor.in_world(frame), track)
+    return _Linked(frame, sensor, sensor.measured_at(frame), sensor.in_world(frame), track)
 
 
 def _trajectories(linked: Sequence[_Linked]) -> dict[int, DetectedTrajectory]:

@@ -292,6 +292,10 @@ class Sensor(Settings):
         doubt = 1 - probability
         return scale * (1 + scale_growth * doubt), bias * (1 + bias_growth * doubt)
 
+    def measured_at(self, frame: Frame) -> float:
+        """Time at which a frame of this sensor was measured, s."""
+        return frame.timestamp + self.time_offset
+
     def in_world(self, frame: Frame) -> Detections:
         """The detections of a frame of this sensor, in world coordinates; `InputError` where the pose is unknown."""
         if frame.coordinates == "world":

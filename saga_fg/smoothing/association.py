@@ -176,7 +176,7 @@ def gather_evidence(
 
 def measured_in_order(frames: Sequence[Frame], sensors: Mapping[str, Sensor]) -> list[tuple[float, Frame]]:
     """Sort frames by their times of measurement (s), which are returned with them: offline, no frame is late."""
-    timed = [(frame.timestamp + sensor_model(sensors, frame.sensor).time_offset, frame) for frame in frames]
+    timed = [(sensor_model(sensors, frame.sensor).measured_at(frame), frame) for frame in frames]
     return sorted(timed, key=lambda pair: pair[0])
 
 

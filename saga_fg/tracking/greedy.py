@@ -100,7 +100,7 @@ class GreedyTracker:
         require_type("frame", frame, Frame)
         sensor = sensor_model(self.sensors, frame.sensor)
         detections = sensor.in_world(frame)
-        timestamp = frame.timestamp + sensor.time_offset
+        timestamp = sensor.measured_at(frame)
         verdict, self._clock = self._clock.judged(timestamp, frame.sensor, MAX_JUMP, MAX_DELAY)
         self.time_verdict, now = verdict, self._clock.newest
         if verdict in ("late", "unconfirmed"):

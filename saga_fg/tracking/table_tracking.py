@@ -199,7 +199,7 @@ def predict(
 
 
 class TableScenes(NamedTuple):
-    """The scenes of a table of detections, and how to track them; named: they have a column `scene`."""
+    """The scenes of a table of detections, and how to track them; is_named: they have a column `scene`."""
 
     scenes: list[Scene]
     settings: TrackerSettings
@@ -212,7 +212,7 @@ class TableScenes(NamedTuple):
 
     def stamps(self, scene: Scene) -> list[float]:
         """Return the times of the frames of a scene by the clock of its tracks, s: with the offsets of sensors."""
-        return [frame.timestamp + sensor_model(self.sensors, frame.sensor).time_offset for frame in scene.frames]
+        return [sensor_model(self.sensors, frame.sensor).measured_at(frame) for frame in scene.frames]
 
     def named(self, scene: str, columns: Mapping[str, Any]) -> dict[str, Any]:
         """Columns of a table about a scene, with its name where scenes have one."""

@@ -153,7 +153,7 @@ class Tracker:
     def _step(self, state: TrackerState, frame: Frame) -> Tracks:
         """Take a frame into a state."""
         sensor = self.sensor(frame.sensor)
-        timestamp = frame.timestamp + sensor.time_offset
+        timestamp = sensor.measured_at(frame)
         if state.accept_time(timestamp, frame.sensor, self.max_jump, self.max_delay):
             time = state.relative(state.clock.time_of(timestamp, frame.sensor))
             return self._process_frame(state, frame, sensor, time)
@@ -185,7 +185,7 @@ class Tracker:
         if sensor.calibrate_noise:
             measurements = with_scale(measurements, noise)
         measurements = measurements.with_context(delay, state.ego.relative_positions(measurements, frame))
-        stamp = frame.timestamp + sensor.time_offset
+        stamp = sensor.measured_at(frame)
         state.clock, state.shared = compared(state.clock, state.shared, stamp, measurements)
         state.map_nodes.update(frame, sensor, state.origin, state.joint, delay)
         look(state, measurements)
