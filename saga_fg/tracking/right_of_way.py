@@ -23,6 +23,7 @@ largest of its p, and its acceleration along its path is the mean of both, d m b
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -90,16 +91,21 @@ class RightOfWay:
         line = {pair: place for pair, place in self.line.items() if nodes.isdisjoint(pair)}
         return replace(self, motion=motion, arrived=arrived, probability=probability, line=line)
 
+    @cached_property
+    def _waiting(self) -> dict[int, tuple[float, FloatArray]]:
+        """Vehicles that may wait, by id: the probability, and the place (2,) of the line."""
+        found = dict[int, tuple[float, FloatArray]]()
+        for pair, place in self.line.items():
+            if (p := self.probability.get(pair, 0.0)) > found.get(pair[0], (0.0,))[0]:
+                found[pair[0]] = p, place
+        return found
+
     def accelerations(
         self, ids: IntArray, position: FloatArray, heading: FloatArray, speed: FloatArray, free: FloatArray
     ) -> FloatArray:
         """Expected accelerations (k,) of vehicles along their paths, m/s^2; `free` (k,): of those that do not wait."""
-        waiting = dict[int, tuple[float, FloatArray]]()
-        for pair, place in self.line.items():
-            if (p := self.probability.get(pair, 0.0)) > waiting.get(pair[0], (0.0,))[0]:
-                waiting[pair[0]] = p, place
-        rows = np.flatnonzero([node in waiting for node in ids.tolist()])
-        known = [waiting[node] for node in ids[rows].tolist()]
+        rows = np.flatnonzero([node in self._waiting for node in ids.tolist()])
+        known = [self._waiting[node] for node in ids[rows].tolist()]
         share, places = np.array([p for p, _ in known]), np.array([place for _, place in known]).reshape(-1, 2)
         left, _ = ahead_and_aside(places - position[rows], unit(heading[rows]))
         braking = np.where(left > -PASSED, speed[rows] ** 2 / (2 * np.maximum(left, AT_LINE)), 0.0)
