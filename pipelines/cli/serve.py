@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from data_tools.datasets.detection_file_source import LIKE_TEXT
 from data_tools.datasets.mcap.dataset import RecordingOptions
 from data_tools.datasets.mcap.source import sensor_topics
 from data_tools.datasets.mcap.transforms import DEFAULT_EGO, WORLD
@@ -88,8 +89,8 @@ class ServiceOptions:
         Literal["plain", "dense"] | None,
         typer.Option(
             "--like",
-            help="Settings to begin with: dense for road traffic seen by a sensor that stands or hovers, plain for all "
-            "else; --config lies over them.  [default: plain, and the log says if the first frames look dense]",
+            help=f"{LIKE_TEXT}; --config lies over them.  [default: plain, and the log says if the first frames look "
+            "dense]",
         ),
     ] = None
 

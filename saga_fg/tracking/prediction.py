@@ -285,16 +285,16 @@ def look_ahead(state: TrackerState, horizons: FloatArray, joint: bool = False) -
         last.id,
         last.label,
         yaw=yaw,
-        **_moments(state, [now.select(rows) for now, rows in zip(expected, kept, strict=True)]),
+        **_world_columns(state, [now.select(rows) for now, rows in zip(expected, kept, strict=True)]),
         modes=(
-            PredictedMode("moving", 1 - stands, **_moments(state, moves)),
-            PredictedMode("stationary", stands, **_moments(state, standing)),
+            PredictedMode("moving", 1 - stands, **_world_columns(state, moves)),
+            PredictedMode("stationary", stands, **_world_columns(state, standing)),
         ),
         joint_covariance=whole,
     )
 
 
-def _moments(state: TrackerState, each: Sequence[Kinematics]) -> dict[str, Any]:
+def _world_columns(state: TrackerState, each: Sequence[Kinematics]) -> dict[str, Any]:
     """Columns (H, N, ...) of what is predicted in the world, by the kinematics of N tracks at each of H horizons."""
     position, velocity, P, P_velocity = (np.stack(columns) for columns in zip(*each, strict=True))
     return {

@@ -162,7 +162,7 @@ def _growing(squares: Mapping[tuple[str, int], _Squares], whole: float) -> dict[
     return found
 
 
-def with_scale(measurements: FrameMeasurements, noise: SensorNoise) -> FrameMeasurements:
+def with_found_noise(measurements: FrameMeasurements, noise: SensorNoise) -> FrameMeasurements:
     """The measurements with the noise that was found, where it did not come with the detections."""
     free = measurements.by_model
     s = noise.scales(measurements.boxes.label[free], measurements.distance[free])
@@ -173,7 +173,7 @@ def with_scale(measurements: FrameMeasurements, noise: SensorNoise) -> FrameMeas
 
 
 def for_gates(measurements: FrameMeasurements, noise: SensorNoise) -> FrameMeasurements:
-    """The measurements of `with_scale` as they are to be gated: with more noise as long as it is not known."""
+    """The measurements of `with_found_noise` as they are to be gated: with more noise as long as it is not known."""
     if noise.settled or noise.seen >= ROUGHLY:
         return measurements
     free, R = measurements.by_model, measurements.R.copy()
@@ -181,10 +181,10 @@ def for_gates(measurements: FrameMeasurements, noise: SensorNoise) -> FrameMeasu
     return replace(measurements, R=R)
 
 
-def observed(
+def noise_after(
     noise: SensorNoise, measurements: FrameMeasurements, matching: Matching, track: IntArray, time: float
 ) -> SensorNoise:
-    """Take in the measurements of a frame at `time`, s, as they were before `with_scale`.
+    """Take in the measurements of a frame at `time`, s, as they were before `with_found_noise`.
 
     Measurements count that are matched beyond doubt and have the noise of the model. track (k,): of the matching
     """

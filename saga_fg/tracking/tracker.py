@@ -34,7 +34,7 @@ from saga_fg.tracking.map_nodes import MapNodes
 from saga_fg.tracking.measurements import frame_measurements
 from saga_fg.tracking.prediction import judge_edges, look_ahead, predict_state
 from saga_fg.tracking.relinking import hand_over
-from saga_fg.tracking.sensor_noise import UNMEASURED, SensorNoise, for_gates, observed, with_scale
+from saga_fg.tracking.sensor_noise import UNMEASURED, SensorNoise, for_gates, noise_after, with_found_noise
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.tracking.track_life import delete_tracks, initiate_tracks, report_tracks, resolve_tracks
 from saga_fg.tracking.tracker_state import TrackerSnapshot, TrackerState
@@ -183,7 +183,7 @@ class Tracker:
         measurements = frame_measurements(frame, sensor, self.settings.classes, state.confused)
         by_model, noise = measurements, state.noise.get(frame.sensor, UNMEASURED)
         if sensor.calibrate_noise:
-            measurements = with_scale(measurements, noise)
+            measurements = with_found_noise(measurements, noise)
         measurements = measurements.with_context(delay, state.ego.relative_positions(measurements, frame))
         stamp = sensor.measured_at(frame)
         state.clock, state.shared = compared(state.clock, state.shared, stamp, measurements)
@@ -196,7 +196,7 @@ class Tracker:
         self._notify("associate", state, frame.sensor, measurements, matching)
 
         if sensor.calibrate_noise and not noise.settled and delay == 0:
-            noise = observed(noise, by_model, matching, state.table.id[matching.track], state.time)
+            noise = noise_after(noise, by_model, matching, state.table.id[matching.track], state.time)
             state.noise = {**state.noise, frame.sensor: noise}
         if delay == 0:
             follow_encounters(state, measurements, matching, rivals, state.time - before)

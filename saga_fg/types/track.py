@@ -327,6 +327,7 @@ class PredictedTracks(ShownTable):
 
     @classmethod
     def empty(cls, timestamp: float, horizons: FloatArray) -> Self:
+        """No tracks, predicted to horizons (H,), s."""
         h = len(horizons)
         none, vectors, matrices = np.empty((h, 0)), np.empty((h, 0, 2)), np.empty((h, 0, 2, 2))
         ids, label = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.str_)
@@ -351,11 +352,11 @@ class PredictedTracks(ShownTable):
         modes: a row for each mode, with its name and probability, in place of their mean and covariance
         """
         if not modes:
-            return self._names() | self._moments(self)
+            return self._names() | self._state_columns(self)
         parts = [
             self._names()
             | {"mode": np.full(mode.probability.size, mode.name), "probability": mode.probability.ravel()}
-            | self._moments(mode)
+            | self._state_columns(mode)
             for mode in self.modes
         ]
         whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -368,7 +369,7 @@ class PredictedTracks(ShownTable):
         times = {"timestamp": np.full(h * n, self.timestamp), "horizon": np.repeat(self.horizons, n)}
         return times | {"id": np.tile(self.id, h), "label": np.tile(self.label, h)}
 
-    def _moments(self, of: PredictedTracks | PredictedMode) -> dict[str, FloatArray]:
+    def _state_columns(self, of: PredictedTracks | PredictedMode) -> dict[str, FloatArray]:
         vectors: tuple[Vectors, ...] = (
             (("x", "y"), of.position.reshape(-1, 2)),
             (("yaw",), self.yaw.reshape(-1, 1)),

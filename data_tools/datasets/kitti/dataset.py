@@ -169,7 +169,7 @@ def world_position(latitude: FloatArray, longitude: FloatArray, altitude: FloatA
 
 
 def read_sensors(path: str | Path) -> dict[str, FloatArray]:
-    """What the K records say by sensor, in the vehicle's axes. Raises `InputError` as `read_poses` does.
+    """Measurements of each sensor in K records, in the vehicle's axes. Raises `InputError` as `read_poses` does.
 
     gps (K, 3): positions as in `read_poses`, m; wheels (K, 1): speed ahead, m/s; imu (K, 6): specific force, m/s^2,
     and turn rate, rad/s

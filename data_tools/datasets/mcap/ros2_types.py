@@ -107,8 +107,10 @@ def decoder(type_: str, text: str | None = None) -> Callable[[bytes], Any]:
     """
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    store, name = known_types(), _full(plain_type(type_))
-    if text is not None:
+    name = _full(plain_type(type_))
+    if text is None:
+        store = known_types()
+    else:
         store = get_typestore(Stores.EMPTY)
         types = get_types_from_msg(text.replace("\r\n", "\n"), name)
         for _, fields in types.values():
