@@ -212,8 +212,8 @@ def scan_map_from_above(
     if tracks:
         ax.add_collection(LineCollection(list(tracks), colors="#2ca02c", linewidths=1.2, label="objects"))
         ax.plot(*np.array([track[-1] for track in tracks]).T, "s", color="#2ca02c", markersize=3)
-    for row, ((name, path), colour) in enumerate(zip(paths.items(), ("black", "#1f77b4", "#e377c2"), strict=False)):
-        ax.plot(*path[:, :2].T, color=colour, linewidth=1.5 if row else 4.0, label=name)
+    for row, (name, path) in enumerate(paths.items()):
+        ax.plot(*path[:, :2].T, color=f"C{row - 1}" if row else "black", linewidth=1.5 if row else 4.0, label=name)
     ax.set(aspect="equal", xlabel="x, m", ylabel="y, m", xlim=(left, right), ylim=(bottom, top))
     ax.legend(frameon=True, fontsize=9, loc="upper right")
     return figure

@@ -21,9 +21,16 @@ from pipelines.cli.options import Config, Verbose, as_command
 from pipelines.slam.configuration import load_slam_config, sensor_log
 from pipelines.slam.drive import Origin, SlamMap, read_map
 from pipelines.slam.laser_slam import laser_slam
-from pipelines.slam.lidar_slam import lidar_slam, path_tracker, with_objects
+from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam, path_tracker, with_objects
 from pipelines.slam.localisation import LocaliserSettings, localise
-from pipelines.slam.results import write_laser_slam, write_lidar_slam, write_localised, write_pose_graph
+from pipelines.slam.merging import merge_sessions, read_session
+from pipelines.slam.results import (
+    write_laser_slam,
+    write_lidar_slam,
+    write_localised,
+    write_merged,
+    write_pose_graph,
+)
 from saga_fg import InputError
 from saga_fg.errors import error_context
 from saga_fg.numerics import IntArray, yaw_transform
@@ -284,6 +291,38 @@ def _localise(
             typer.echo(f"against the recording, {what}: ATE {ate:.3f} m, end {end:.3f} m")
 
 
+def merge(
+    runs: Annotated[list[Path], typer.Argument(help="Output folders of `saga-fg slam scans`.", metavar="RUN RUN ...")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder to write.")],
+    verbose: Verbose = False,
+) -> None:
+    """Put several drives into one map, in the world of the first.
+
+    Places that the drives have in common are looked for without a guess and become loops between the drives; false ones
+    are left out. Writes the path of each drive (paths/NAME.tum), the map (map.ply; map/ for --map), the graph
+    (graph.g2o), a picture from above (above.png) and counts (metrics.json).
+
+    \b
+    Examples:
+      saga-fg slam merge monday tuesday --output both
+      saga-fg slam merge runs/* --output town
+      saga-fg slam scans wednesday.mcap --map town --output in_town
+    """
+    names = [run.resolve().name for run in runs]
+    if len(runs) < 2 or len(set(names)) < len(names):
+        raise InputError(f"RUN: expected two folders or more of different names, got {', '.join(names)}")
+    if output.resolve() in [run.resolve() for run in runs]:
+        raise InputError(f"--output {output}: expected another folder than those of the runs, which would lose files")
+    check_writable_folder(output)
+    with progress_bar(unit="drives") as progress:
+        merged = merge_sessions([read_session(run) for run in runs], progress)
+    figures = write_merged(output, merged, LidarSlamSettings().map_spacing)
+    loops = (
+        f"{counted(figures['loops_between'], 'loop')} between them, {figures['false_loops_between']} left out as false"
+    )
+    typer.echo(f"{output}: {counted(len(runs), 'drive')}, {counted(figures['submaps'], 'submap')}, {loops}")
+
+
 def _numbers(option: str, what: str, count: int, text: str) -> list[float]:
     """Finite numbers of a text "1.5,-3,1.8,0.2"."""
     try:
@@ -431,5 +470,5 @@ def laser(
 
 
 slam_app = new_group("Estimate where the vehicle was and what stands around it, in one factor graph.")
-for run in (scans, g2o, laser):
+for run in (scans, merge, g2o, laser):
     slam_app.command()(as_command(run))

@@ -87,8 +87,8 @@ class KnownMap:
         near = np.flatnonzero(apart <= max(RADIUS, float(apart.min())))
         return placed_clouds([self._map.points[k] for k in near.tolist()], self._map.map_T_submap[near])
 
-    def recognised(self, query: FloatArray, near: FloatArray | None = None) -> FloatArray | None:
-        """map_T_query (4, 4) of the one place that points (N, 3), z up, show, None for none and for several.
+    def recognised(self, query: FloatArray, near: FloatArray | None = None) -> Registration | None:
+        """The registration at the one place that points (N, 3), z up, show, None for none and for several.
 
         near: a place (2,) or (3,) in the map; places farther than the radius from it are left out
         """
@@ -103,16 +103,16 @@ class KnownMap:
         if near is not None:
             older = np.flatnonzero(np.linalg.norm(frames[:, :2, 3] - near[:2], axis=1) <= RADIUS).tolist()
         mine, points = Structure.of(query), query[voxel_downsample(query, SCAN_SPACING)]
-        sure, fitting = list[tuple[float, FloatArray]](), 0
+        sure, fitting = list[tuple[float, Registration]](), 0
         for match in self._index.candidates(PlaceImage.of(query), older, COMPARED)[:_REGISTERED]:
             around = self.around(frames[match.number][:3, 3])
             fine = registered(around, points, frames[match.number] @ match.place_T_query)
             if fine is not None and (overlap := Structure.of(around).shared(mine, fine.map_T_scan)) > MIN_OVERLAP:
                 fitting += 1
                 if not fits_otherwise(match):
-                    sure.append((overlap, fine.map_T_scan))
+                    sure.append((overlap, fine))
         sure.sort(key=lambda one: -one[0])
-        places = np.array([map_T_query[:3, 3] for _, map_T_query in sure])
+        places = np.array([fine.map_T_scan[:3, 3] for _, fine in sure])
         agreed = agreeing(places, np.array([overlap for overlap, _ in sure])) if sure else []
         self.ambiguous = fitting > 0 and not agreed
         return sure[0][1] if agreed else None
@@ -328,14 +328,14 @@ class Localiser:
         query, frame = self._seen()
         thin = query[voxel_downsample(query, 0.5)]
         fix = self._fix_nearby()
-        map_T_frame = None if fix is None else self._map.recognised(thin, fix)
-        if map_T_frame is None:
-            map_T_frame = self._map.recognised(thin)
+        found = None if fix is None else self._map.recognised(thin, fix)
+        if found is None:
+            found = self._map.recognised(thin)
         self._searched = self.way
-        if map_T_frame is None:
+        if found is None:
             self._clouds = self._clouds[len(self._clouds) // 2 :]
         else:
-            self._begin(map_T_frame @ inverse_transform(frame) @ self._path.poses[row])
+            self._begin(found.map_T_scan @ inverse_transform(frame) @ self._path.poses[row])
             self._add(row, points)
 
     def _fix_nearby(self) -> FloatArray | None:

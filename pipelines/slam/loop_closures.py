@@ -143,7 +143,7 @@ _SURELY = 0.75  # shared structure that a loop needs beyond the drift of odometr
 _ALONE = 0.85  # and without one, up to twice the drift
 _FARTHEST = (35.0, 0.1)  # m, and m for each m of way: beyond, two places are not the same
 _OPEN = 0.5  # m, standard deviation of an alignment of images
-_DISTORTION = np.array([1e-3] * 3 + [0.05] * 3) ** 2  # rad^2 and m^2, of submaps, which are never quite straight
+DISTORTION = np.array([1e-3] * 3 + [0.05] * 3) ** 2  # rad^2 and m^2, of submaps, which are never quite straight
 
 
 @dataclass(frozen=True)
@@ -281,7 +281,7 @@ class PlaceLoops(LoopSearch):
             return None, 0.0
         overlap = Structure.of(old).shared(Structure.of(new), fine.map_T_scan)
         open_by_surfaces = fine.observed.open(_OPEN**2)  # known by the images
-        covariance = fine.covariance + np.diag(_DISTORTION) + open_by_surfaces
+        covariance = fine.covariance + np.diag(DISTORTION) + open_by_surfaces
         return LoopClosure(match.number, number, fine.map_T_scan, covariance), overlap
 
     def _unrivalled(self, found: list[_Proved], frames: FloatArray) -> list[_Proved]:

@@ -40,6 +40,9 @@ Results of localisation: the path in the map's frame (trajectory.tum, trajectory
 covariances.csv of the sensor's pose at each scan, and whether that was registered with the map, above.png, and in
 metrics.json errors against the recording's poses, as they are and with the path aligned, and counts.
 
+Results of several drives in one map, in the world of the first: paths/NAME.tum of each, map/, map.ply, graph.g2o of the
+keyframes of all with the loops between them, above.png, and counts in metrics.json.
+
 World coordinates are those of the recording (KITTI: x east, y north, z up, from the first pose).
 """
 
@@ -63,6 +66,7 @@ from pipelines.slam.driver import SlamResult
 from pipelines.slam.laser_slam import LaserPath
 from pipelines.slam.lidar_slam import WALL, LidarSlamSettings
 from pipelines.slam.localisation import LocalisedDrive
+from pipelines.slam.merging import MergedDrives
 from saga_fg.numerics import FloatArray, IntArray, in_space, inverse_transform, transform_points, transforms
 from saga_fg.slam.joint import JointEstimate
 from saga_fg.slam.pose_graph import OptimisedPoses, PoseGraph
@@ -395,6 +399,35 @@ def write_localised(output: Path, found: LocalisedDrive, scans: ScanSequence, sl
         write_covariances(folder / "covariances.csv", "timestamp", times, found.covariances, registered=registered)
         drawn = {} if truth is None else {"reference": truth.positions}
         drawn["trajectory"] = path.positions
+        write_bytes(folder / "above.png", png(scan_map_from_above(points, drawn, np.empty((0, 2)), {})))
+        write_figures(folder / "metrics.json", figures)
+    return figures
+
+
+MERGED_FILES = ("paths/*.tum", "map.ply", *LIDAR_FILES[7:10], "graph.g2o", "above.png", "metrics.json")
+
+
+def write_merged(output: Path, merged: MergedDrives, spacing: float) -> dict[str, Any]:
+    """Write all files, or none; returns the metrics. spacing: of the points of map.ply, m."""
+    slam_map, names = merged.slam_map, [one.name for one in merged.sessions]
+    points = placed_clouds(slam_map.points, slam_map.map_T_submap, spacing)
+    paths = dict(zip(names, (one.path for one in merged.sessions), strict=True))
+    figures: dict[str, Any] = {
+        "drives": names,
+        "keyframes": [len(one.graph) for one in merged.sessions],
+        "submaps": len(slam_map.points),
+        "loops_between": len(merged.loops),
+        "false_loops_between": len(merged.false_loops),
+    }
+    with atomic_directory(output, known=MERGED_FILES) as folder:
+        for sub in ("paths", "map"):
+            (folder / sub).mkdir()
+        for name, path in paths.items():
+            write_tum_poses(folder / "paths" / f"{name}.tum", path)
+        write_map(folder / "map", slam_map)
+        write_cloud(folder / "map.ply", points)
+        write_g2o(folder / "graph.g2o", merged.graph)
+        drawn = {name: path.positions for name, path in paths.items()}
         write_bytes(folder / "above.png", png(scan_map_from_above(points, drawn, np.empty((0, 2)), {})))
         write_figures(folder / "metrics.json", figures)
     return figures
