@@ -1,9 +1,10 @@
 """The vehicle and the objects around it in one graph, against one after the other, with poor odometry.
 
 Decoupled: the odometry's path, and the tracker along it. Joint: odometry and objects in one graph. Held: objects by the
-same graph, with past and future, the path held where the odometry has it. Online: the joint estimate in a running
-graph, read out at every frame. All know the same odometry, degraded by errors sampled with a seed. Paths are aligned
-with the true one before their absolute trajectory error (ATE) is taken.
+same graph, with past and future, the path held where the odometry has it. Online, joint is the tracker that estimates
+the vehicle's pose with its tracks (`ego.estimated`, `saga_fg.providers:Odometry` with the errors of the device), read
+out at every frame, and follow a tracker along the path that it finds. All know the same odometry, degraded by errors
+sampled with a seed. Paths are aligned with the true one before their absolute trajectory error (ATE) is taken.
 
 A pair is an object at a frame, with a detection within `NEAR` of the truth along the true path, of a track that has
 detected it in at least `SETTLED` frames before: earlier, velocities are the priors of new tracks. Contenders are
@@ -12,20 +13,13 @@ compared on the pairs that all of them have. With the estimated and the true pos
     in the world    p - p',  v - v'                     from it    R^T (p - t) - R'^T (p' - t'),  R^T v - R'^T v'
 
 Intervals are paired bootstraps over recordings, the seeds of one taken together, of changes of pooled errors.
-
-Online, each frame adds an epoch to the running graph of the last seconds. The stationarity of objects follows from
-the window, and iSAM2 solves that with the new factors. Epochs older than `lag` leave: they are marginalised with all
-factors on their variables, linearised at the present estimate. On recordings it pays neither for the path nor for the
-objects beside a tracker along LiDAR odometry, so that no command offers it.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -42,172 +36,22 @@ from pipelines.cli.options import Config
 from pipelines.config import TrackConfig, load_config
 from pipelines.slam.lidar_slam import path_tracker
 from saga_fg.errors import InputError
-from saga_fg.estimators import GraphSolution, IncrementalSmoother, RelinearisationSettings
-from saga_fg.graph import EGO_POSE, Additions, FactorProvider, Factors, GraphError, GraphView
-from saga_fg.numerics import (
-    Assignment,
-    FloatArray,
-    IntArray,
-    assign,
-    checked_covariances,
-    checked_transform,
-    yaw_transform,
+from saga_fg.graph import EGO_POSE, Additions, GraphView
+from saga_fg.numerics import Assignment, FloatArray, IntArray, assign, yaw_of
+from saga_fg.providers import Odometry, OdometryNoise, StartSettings
+from saga_fg.slam.joint import JointSettings, OdometryIncrements, estimate_jointly
+from saga_fg.slam.joint.graph import ObjectStates
+from saga_fg.slam.joint.record import KEYFRAME_PERIOD, in_ego
+from saga_fg.tracking import EgoNodeSettings, Tracker
+from saga_fg.types import (
+    Annotations,
+    Boxes,
+    Detections,
+    EgoMeasurements,
+    Frame,
+    OdometryIncrement,
+    Scene,
 )
-from saga_fg.slam.joint import (
-    JointSettings,
-    OdometryIncrements,
-    OdometryNoise,
-    estimate_jointly,
-)
-from saga_fg.slam.joint.graph import (
-    JointEstimate,
-    ObjectStates,
-    Record,
-    VehicleAndObjects,
-    error_key,
-    read_estimate,
-    stationary_factors,
-)
-from saga_fg.slam.joint.record import (
-    KEYFRAME_PERIOD,
-    MAX_ITERATIONS,
-    EpochRecorder,
-    RecordedEpoch,
-    in_ego,
-    stationary_probabilities,
-)
-from saga_fg.slam.mapping import Given, pose_key
-from saga_fg.tracking import Tracker
-from saga_fg.types import Annotations, Boxes, Detections, Frame, Scene
-
-_SAME = 1e-3  # probability
-
-
-class StationaryPairs:
-    """Factors of stationary objects for every two epochs, given anew where the probabilities have changed."""
-
-    name = "stationary objects"
-
-    def __init__(self) -> None:
-        self._given: dict[int, tuple[FloatArray, FloatArray]] = {}
-
-    def changed(self, record: Record, stationary: Sequence[FloatArray]) -> Given:
-        """Return the provider of a window, with the probabilities (n,) of the objects of each epoch."""
-        named: dict[Hashable, Factors] = {}
-        given: dict[int, tuple[FloatArray, FloatArray]] = {}
-        for pair, rows in zip(pairwise(stationary), pairwise(record), strict=True):
-            k, before = rows[1].epoch, self._given.get(rows[1].epoch)
-            if before is None or not all(np.allclose(a, b, atol=_SAME) for a, b in zip(before, pair, strict=True)):
-                named[k], before = stationary_factors(rows, pair), pair
-            given[k] = before
-        self._given = given
-        return Given(Additions(named=named), self.name)
-
-
-_THRESHOLD = 0.1  # standard deviations that a variable moves before its factors are linearised anew
-
-
-class OnlineEstimator:
-    """Estimate one frame after the other.
-
-        estimator = OnlineEstimator(Tracker(...), lag=3.0)
-        newest = estimator.step(frame, a_T_b)
-        newest.world_T_ego[-1], newest.objects[-1]
-
-    tracker    a new one, which associates detections
-    lag        s; the window begins at the last epoch that is at least so old
-    settings   of the graph
-    start      first pose (4, 4), by default the identity
-    providers  of factors of your own, asked with each frame after its vehicle and objects are added
-
-    Raises `InputError` for a negative lag, and a first pose that is not rigid.
-    """
-
-    def __init__(
-        self,
-        tracker: Tracker,
-        lag: float,
-        settings: JointSettings | None = None,
-        start: FloatArray | None = None,
-        providers: Sequence[FactorProvider] = (),
-    ) -> None:
-        if not (math.isfinite(lag) and lag >= 0):
-            raise InputError(f"lag: expected a finite number of seconds >= 0, got {lag!r}")
-        self._settings, self._lag = settings or JointSettings(), lag
-        # without a lag of its own: epochs leave here, and elimination in the order of time would cost thrice as much
-        self._smoother = IncrementalSmoother(providers, None, RelinearisationSettings(_THRESHOLD, MAX_ITERATIONS))
-        self._recorder = EpochRecorder(tracker)
-        self._start = np.eye(4) if start is None else checked_transform("start", start)
-        self._slow = self._settings.odometry.slow
-        self._pairs, self._stationary = StationaryPairs(), list[FloatArray]()
-        self._record = list[RecordedEpoch]()  # of the window
-        self._solution: GraphSolution | None = None
-
-    def step(
-        self, frame: Frame, a_T_b: FloatArray | None = None, covariance: FloatArray | None = None
-    ) -> JointEstimate:
-        """Add the next frame, after the vehicle moved by a_T_b (4, 4) since the last one by its odometry; its estimate.
-
-        a_T_b: not needed for the first frame; covariance: (6, 6) of it as in `OdometryIncrements`, if the device states
-        one. Raises `InputError` for a motion that is missing or not rigid, a bad covariance, a frame that is not later
-        than the last one, or in world coordinates without a pose.
-        """
-        if not self._record:
-            pose, increment, covariance = self._start, np.eye(4), None
-        elif a_T_b is None:
-            raise InputError("a_T_b: expected the motion since the last frame")
-        else:
-            increment = checked_transform("a_T_b", a_T_b)
-            covariance = None if covariance is None else checked_covariances("covariance", [covariance], 1, 6)[0]
-            pose = self._predicted(frame.timestamp, increment)
-        number = self._record[-1].epoch + 1 if self._record else 0
-        now = self._recorder.add(number, frame, pose, increment, covariance)
-        record = [*self._record, now]
-        self._stationary = self._probabilities(record, [*map(self._pose, self._record), pose])
-        new = VehicleAndObjects(record[-2:], [pose], self._settings, known=len(record[-2:]) - 1)
-        given = self._pairs.changed(record, self._stationary)
-        try:
-            self._smoother.step(now.time, [new, given, *self._smoother.providers], frame)
-        except GraphError:
-            self._pairs = StationaryPairs()  # whose factors are unknown now
-            raise
-        self._record, self._solution = record, self._smoother.solution()
-        newest = self._estimate(1)
-        since = now.time - self._lag
-        gone = sum(one.time <= since for one in record[1:])
-        self._smoother.forget(since=since)
-        self._record, self._stationary = self._record[gone:], self._stationary[gone:]
-        self._slow = newest.slow_errors
-        return newest
-
-    def window(self) -> JointEstimate:
-        """The estimate of all epochs in the window. Raises `InputError` before the first frame."""
-        if not self._record:
-            raise InputError("expected a frame before the estimate is asked for")
-        return self._estimate(len(self._record))
-
-    def _estimate(self, count: int) -> JointEstimate:
-        """The estimate of the newest epochs by the last solution, which has the epochs that left after it, too."""
-        assert self._solution is not None
-        return read_estimate(self._record[-count:], self._solution, self._stationary[-count:])
-
-    def _probabilities(self, record: Sequence[RecordedEpoch], path: Sequence[FloatArray]) -> list[FloatArray]:
-        """For each epoch the probabilities that its objects are stationary, along a path (n, 4, 4)."""
-        return stationary_probabilities(record, np.stack(path), self._slow, self._settings, online=True)
-
-    def _pose(self, epoch: RecordedEpoch) -> FloatArray:
-        pose = self._smoother.state(pose_key(epoch.epoch))
-        assert isinstance(pose, gtsam.Pose3)
-        return pose.matrix()
-
-    def _predicted(self, time: float, a_T_b: FloatArray) -> FloatArray:
-        """The pose (4, 4) after the motion a_T_b, corrected by the estimated errors of the odometry."""
-        last = self._record[-1]
-        scale, bias, course = np.asarray(self._smoother.state(error_key(last.epoch)))
-        step = yaw_transform(yaw=-bias * (time - last.time)) @ a_T_b
-        step[:3, 3] = yaw_transform(yaw=-course)[:3, :3] @ a_T_b[:3, 3] / (1 + scale)
-        return np.asarray(self._pose(last) @ step)
-
 
 SENSOR = "lidar"
 NEAR, SETTLED, MOVING = 2.0, 3, 1.0  # m, of a detection from the object that it is of; frames; m/s
@@ -227,8 +71,9 @@ def joint(
     ] = None,
     scenes: Annotated[int, typer.Option("--scenes", min=2, help="Simulated scenes.")] = 10,
     seeds: Annotated[int, typer.Option("--seeds", min=1, help="Samples of the odometry's errors per recording.")] = 1,
-    online: Annotated[bool, typer.Option("--online", help="In a running graph, frame by frame.")] = False,
-    lag: Annotated[float, typer.Option("--lag", min=0.0, help="Of the running graph, s.")] = 3.0,
+    online: Annotated[
+        str, typer.Option("--online", help="Frame by frame, by this estimator: isam2 or fixed-lag.", metavar="NAME")
+    ] = "",
     config: Config = None,
 ) -> Rows:
     """Joint against decoupled estimation with degraded odometry: errors of the path and of the objects.
@@ -240,7 +85,7 @@ def joint(
     Examples:
       python -m benchmarks joint --scenes 10
       python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --seeds 10
-      python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --online
+      python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --online isam2
     """
     if (dataroot is None) != (detections is None):
         raise InputError("expected both --dataroot and --detections, or neither")
@@ -250,7 +95,7 @@ def joint(
         found = KittiTracking(dataroot, detections, None, True)
         many = [found.scene(name) for name in found.scenes]
     base = load_config("simulated" if dataroot is None else "kitti", config)
-    run = partial(online_run, lag=lag) if online else batch_run
+    run = partial(online_run, estimator=online) if online else batch_run
     yield from joint_rows(many, range(seeds), partial(run, config=base, settings=JointSettings()))
 
 
@@ -268,7 +113,7 @@ class Outcome:
         self.paths[name], self.figures[column] = np.array([error**2 * poses, poses]), error
 
 
-OBJECTS = (("joint", "decoupled"), ("joint", "held"))
+OBJECTS = (("joint", "decoupled"), ("joint", "held"), ("joint", "follow"))
 
 
 def joint_rows(scenes: Sequence[Scene], seeds: Sequence[int], run: Callable[..., Outcome]) -> Iterator[Row]:
@@ -375,25 +220,34 @@ def batch_run(scene: Scene, seed: int, config: TrackConfig, settings: JointSetti
     return outcome
 
 
-def online_run(scene: Scene, seed: int, config: TrackConfig, settings: JointSettings, lag: float) -> Outcome:
-    """In a running graph, read out at every frame. Raises `InputError` for a scene without ground truth."""
+def online_run(scene: Scene, seed: int, config: TrackConfig, settings: JointSettings, estimator: str) -> Outcome:
+    """Frame by frame. Raises `InputError` for a scene without ground truth."""
     if scene.ground_truth is None:
         raise InputError(f"scene {scene.name}: expected ground truth")
     frames, path, odometry = degraded_drive(scene, settings, SENSOR, seed)
     driven, outcome = odometry.path(path.world_T_ego[0]), Outcome()
-    alone, joined = path_tracker(config), path_tracker(config)
-    estimator = OnlineEstimator(joined, lag, settings, start=path.world_T_ego[0])
+    dt, a_T_b = [1.0, *odometry.dt.tolist()], [np.eye(4), *odometry.a_T_b]
+    alone, follower = path_tracker(config), path_tracker(config)
+    x, y, _ = path.world_T_ego[0, :3, 3].tolist()
+    start = (x, y, float(yaw_of(path.world_T_ego[0, :3, :3])))
+    first = StartSettings(start, deviation=1e-3, heading_deviation=1e-3, tilt_deviation=1e-3, planar=False)
+    joined = Tracker(
+        replace(config.tracker, estimator=estimator, ego=EgoNodeSettings(estimated=True)),
+        config.sensors,
+        providers=[Odometry(first, errors=settings.odometry)],
+    )
     newest = list[FloatArray]()
 
     def at(k: int, frame: Frame, found: Detections) -> dict[str, State]:
-        tracks = alone.step(Frame(frame.timestamp, frame.sensor, found, driven[k], "ego"))
-        step = estimator.step(frame, odometry.a_T_b[k - 1] if k else None)
-        newest.append(step.world_T_ego[-1])
-        now = step.objects[-1]
-        return {
-            "decoupled": (tracks.id, _planar(tracks.boxes), driven[k], alone.assignment),
-            "joint": (now.id, _planar(now), newest[-1], joined.assignment),
-        }
+        measured = EgoMeasurements(odometry=OdometryIncrement(a_T_b[k], dt[k]))
+        now = joined.step(Frame(frame.timestamp, frame.sensor, found, None, "ego", ego=measured))
+        assert joined.world_T_ego is not None
+        newest.append(joined.world_T_ego)
+        states = {"joint": (now.id, _planar(now.boxes), newest[-1], joined.assignment)}
+        for name, tracker, pose in (("decoupled", alone, driven[k]), ("follow", follower, newest[-1])):
+            now = tracker.step(Frame(frame.timestamp, frame.sensor, found, pose, "ego"))
+            states[name] = now.id, _planar(now.boxes), pose, tracker.assignment
+        return states
 
     outcome.objects = object_sums(scene, frames, path.world_T_ego, config, at)
     for name, poses in (("decoupled", driven), ("joint", np.stack(newest))):

@@ -6,8 +6,9 @@ Each reads what a frame brings (`Frame.ego`) and works in the running graph wher
     providers: [{kind: "saga_fg.providers:Odometry"}, {kind: "saga_fg.providers:Gps", deviation: 0.5}]
 """
 
+from saga_fg.providers.odometry import Odometry, OdometryNoise, StartSettings
 from saga_fg.providers.surroundings import Landmarks, LaneKeeping, RelativeDetections
-from saga_fg.providers.vehicle_sensors import Gps, Imu, Odometry, StartSettings, Wheels
+from saga_fg.providers.vehicle_sensors import Gps, Imu, Wheels
 
 __all__ = [
     "Gps",
@@ -15,6 +16,7 @@ __all__ = [
     "Landmarks",
     "LaneKeeping",
     "Odometry",
+    "OdometryNoise",
     "RelativeDetections",
     "StartSettings",
     "Wheels",

@@ -19,7 +19,7 @@ from saga_fg.errors import InputError
 from saga_fg.graph import EGO_POSE, LANDMARK, MAP_NODE, OBJECT, Additions, Factor, GraphView, NewVariable
 from saga_fg.model import PointLandmark
 from saga_fg.numerics import FloatArray, IntArray, feet, on_it
-from saga_fg.providers.vehicle_sensors import NO_POSE
+from saga_fg.providers.odometry import NO_POSE
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.types import VEHICLES, Lane, Observation
 

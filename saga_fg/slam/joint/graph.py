@@ -273,21 +273,20 @@ def _objects(now: RecordedEpoch, values: gtsam.Values, stationary: FloatArray) -
 
 @dataclass(frozen=True, eq=False)
 class VehicleAndObjects:
-    """Add the epochs of `record`, one a frame, of which the graph has the first `known` already.
+    """Add the epochs of `record`, one a frame.
 
-    path: expected poses (4, 4) of the others. Odometry and detections come with the last epoch, so that all are
+    path: expected poses (4, 4) of all. Odometry and detections come with the last epoch, so that all are
     linearised together.
     """
 
     record: Record
     path: Sequence[FloatArray] | FloatArray
     settings: JointSettings
-    known: int = 0
     name: str = "vehicle and objects"
 
     def factors(self, view: GraphView) -> Additions:
         row = view.epoch - self.record[0].epoch
-        now, pose, k = self.record[row], self.path[row - self.known], view.epoch
+        now, pose, k = self.record[row], self.path[row], view.epoch
         slow = view.state(error_key(k - 1)) if k else np.zeros(ERROR_DIM)
         new = [NewVariable(EGO_POSE, 0, gtsam.Pose3(pose), label="vehicle"), NewVariable(EGO_ERROR, 0, slow)]
         moved = Additions() if now.transition is None else Interactions(now.transition).factors(view)
@@ -305,8 +304,8 @@ class VehicleAndObjects:
             factors.append(prior_factor(error_key(k), np.zeros(ERROR_DIM), errors))
             factors.append(pose_prior_factor(pose_key(k), pose, _START_NOISE**2 * np.eye(6)))
         if row + 1 == len(self.record):
-            factors += odometry(self.record[max(self.known - 1, 0) :], self.settings)
-            factors += detections(self.record[self.known :], self.settings)
+            factors += odometry(self.record, self.settings)
+            factors += detections(self.record, self.settings)
         return Additions(new, factors, moved.named)
 
 

@@ -4,16 +4,6 @@ A tracker associates the detections: along a path, given or estimated so far, it
 assignment and its graph of interactions are recorded (`Tracker.assignment`, `Tracker.graph`). Detections are kept in
 the vehicle's frame, where they do not depend on the path.
 
-Odometry: measured motion of a vehicle between epochs, and its noise.
-
-Per interval of dt s and d m, an increment a_T_b has independent noise
-
-    heading      turn_noise^2 dt                     roll, pitch   tilt_noise^2 dt
-    translation  distance_noise^2 d + time_noise^2 dt,  every direction
-
-and three slow errors, a scale of the distance, a bias of the yaw rate and an angle of the course, which start as
-N(0, scale^2), N(0, bias^2), N(0, course^2) and wander as random walks (see `factors.between`).
-
 Stationarity of objects: the probability that each one is at rest, from its detections along a path.
 
 Around each detection of an object, within a window, D is the mean place of the later half of the detections less that
@@ -33,9 +23,6 @@ Where T is short, all these variances are nearly equal, and P is about q_0; so i
 In a queue, cars too far to be seen creeping look parked, and the vehicle's path would bend until they are. But others,
 nearer, are seen to creep. So q_0 is one half, and the other half is divided as the traffic moves then, within 10 s:
 maximum likelihood of all detections by expectation maximisation, with a Dirichlet prior worth a few detections.
-
-Online the window ends now, and T is short: q_0 is `ONLINE_STATIONARY_SHARE`, q_1 = 0, and the last term of S, errors
-of the heading, counts across the line of sight only.
 """
 
 from __future__ import annotations
@@ -48,7 +35,6 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors import ERROR_DIM
 from saga_fg.errors import InputError
 from saga_fg.model import NodeType, Sensor, Transition, discretise
 from saga_fg.numerics import (
@@ -63,6 +49,7 @@ from saga_fg.numerics import (
     inverse_transform,
     transform_points,
 )
+from saga_fg.providers.odometry import OdometryNoise
 from saga_fg.settings import (
     Positive,
     PositiveInt,
@@ -73,39 +60,6 @@ from saga_fg.settings import (
 )
 from saga_fg.tracking import Tracker, frame_measurements, motion_of
 from saga_fg.types import DEFAULT, Detections, Frame, class_numbers
-
-
-@dataclass(frozen=True)
-class OdometryNoise(Settings):
-    """Noise of an odometry: standard deviations."""
-
-    turn_noise: Positive = setting(0.01, "standard deviation of the heading after one second, rad")
-    tilt_noise: Positive = setting(0.001, "standard deviation of roll and pitch after one second, rad")
-    distance_noise: Positive = setting(0.03, "standard deviation of the translation after one metre, m")
-    time_noise: Positive = setting(0.01, "standard deviation of the translation after one second, m")
-    scale: Positive = setting(0.02, "standard deviation of the scale of distances at the start")
-    scale_drift: Positive = setting(0.002, "random walk of the scale in one second")
-    bias: Positive = setting(0.005, "standard deviation of the yaw-rate bias at the start, rad/s")
-    bias_drift: Positive = setting(0.0005, "random walk of the yaw-rate bias in one second, rad/s")
-    course: Positive = setting(0.01, "standard deviation of the course against the sensor axes at the start, rad")
-    course_drift: Positive = setting(0.0003, "random walk of that course in one second, rad")
-
-    @property
-    def slow(self) -> FloatArray:
-        """Deviations (3,) of scale, bias (rad/s) and course (rad) at the start, before any measurement."""
-        return np.array([self.scale, self.bias, self.course])
-
-    def covariances(self, distance: FloatArray, dt: FloatArray) -> FloatArray:
-        """(n, 9, 9) of increments over `distance` (n,) m and `dt` (n,) s > 0.
-
-        Rows: rotation (rad), translation in the frame of the earlier pose (m), change of scale, of bias (rad/s), of
-        course (rad).
-        """
-        tilt, turn = self.tilt_noise**2 * dt, self.turn_noise**2 * dt
-        shift = self.distance_noise**2 * distance + self.time_noise**2 * dt
-        slow = (self.scale_drift**2 * dt, self.bias_drift**2 * dt, self.course_drift**2 * dt)
-        variances = np.stack([tilt, tilt, turn, shift, shift, shift, *slow], axis=1)
-        return np.asarray(variances[:, :, None] * np.eye(6 + ERROR_DIM))
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,14 +269,9 @@ def motion_covariances(record: Sequence[RecordedEpoch], settings: JointSettings)
     Where the device states covariances, these hold for rotation and translation.
     """
     later = record[1:]
-    distance = np.array([np.linalg.norm(now.a_T_b[:3, 3]) for now in later])
-    P = settings.odometry.covariances(distance, np.diff([now.time for now in record]))
-    for row, now in enumerate(later):
-        if now.covariance is not None:
-            axes = np.eye(6)
-            axes[3:, 3:] = now.a_T_b[:3, :3]
-            P[row, :6, :6] = axes @ now.covariance @ axes.T
-    return P
+    steps = np.array([now.a_T_b for now in later]).reshape(-1, 4, 4)
+    dt = np.diff([now.time for now in record])
+    return settings.odometry.of_increments(steps, dt, [now.covariance for now in later])
 
 
 def in_ego(frame: Frame, sensor: Sensor) -> Detections:
@@ -342,14 +291,12 @@ _CREEPING = 0.3  # speed of creeping traffic, as a share of the usual one
 _ALIKE = 10.0  # s, time over which traffic keeps its shares
 _PRIOR = 10.0  # detections of each hypothesis that the prior of the shares is worth
 _ROUNDS = 30  # of expectation maximisation
-ONLINE_STATIONARY_SHARE = 0.1  # prior share of stationary objects online: queues look parked
 
 
 @dataclass(frozen=True, eq=False)
 class _PlacedDetections(Columns):
     """All detections, by object and time: object, row of the record, time (N,), place (N, 2), variance, range, u (N,).
 
-    sight (N, 2): the place less the vehicle's, m
     drift (N, 3): way driven, m, variance of the translation, m^2, and of the heading, rad^2, from the first epoch on
     """
 
@@ -357,7 +304,6 @@ class _PlacedDetections(Columns):
     row: IntArray
     time: FloatArray
     place: FloatArray
-    sight: FloatArray
     variance: FloatArray
     range: FloatArray
     speed: FloatArray
@@ -365,7 +311,7 @@ class _PlacedDetections(Columns):
 
 
 def stationary_probabilities(
-    record: Sequence[RecordedEpoch], path: FloatArray, slow: FloatArray, settings: JointSettings, online: bool = False
+    record: Sequence[RecordedEpoch], path: FloatArray, slow: FloatArray, settings: JointSettings
 ) -> list[FloatArray]:
     """For each epoch the probabilities (n,) that its objects are stationary; path (K, 4, 4) assumed so far.
 
@@ -374,7 +320,7 @@ def stationary_probabilities(
     0 where there are too few detections. Between two detections it is the smaller one of theirs.
     """
     seen = _place(record, path, settings)
-    p = _probabilities(seen, slow, settings, online)
+    p = _probabilities(seen, slow, settings)
     result = [np.zeros(len(now.objects.id)) for now in record]
     if not len(p):
         return result
@@ -390,7 +336,7 @@ def stationary_probabilities(
     return result
 
 
-def _probabilities(seen: _PlacedDetections, slow: FloatArray, settings: JointSettings, online: bool) -> FloatArray:
+def _probabilities(seen: _PlacedDetections, slow: FloatArray, settings: JointSettings) -> FloatArray:
     """P(stationary) (N,) of the object of each detection, around it."""
     n = len(seen.object)
     if n == 0:
@@ -421,26 +367,14 @@ def _probabilities(seen: _PlacedDetections, slow: FloatArray, settings: JointSet
     scale, bias, course = slow
     S = S + shift + (scale**2 + course**2) * s**2
     turned = half(seen.range, low, high) ** 2 * (turn + (bias * T) ** 2)
-    sight = half(seen.sight, low, high)
-    along = (D * sight).sum(axis=1) ** 2 / np.maximum((sight**2).sum(axis=1), 1e-9)
-    d2 = np.stack([along, (D**2).sum(axis=1) - along])  # along the line of sight, and across
-    S = np.stack([S if online else S + turned, S + turned])
+    d2 = (D**2).sum(axis=1)
     usual = (seen.speed * T) ** 2
-    if online:
-        q = ONLINE_STATIONARY_SHARE
-        variances, shares = np.stack([S, S + usual]), np.array([[q], [1 - q]])
-        log = _log_likelihoods(variances, d2)
-    else:
-        variances = np.stack([S, S + _CREEPING**2 * usual, S + usual])
-        log = _log_likelihoods(variances, d2)
-        shares = _shares_of_traffic(log, seen.time, n1 > 0)
+    S = S + turned
+    variances = np.stack([S, S + _CREEPING**2 * usual, S + usual])
+    log = -(np.log(variances) + d2 / variances / 2)
+    shares = _shares_of_traffic(log, seen.time, n1 > 0)
     p = _posteriors(log, shares)[0]
     return np.where(n1 > 0, p, 0.0)
-
-
-def _log_likelihoods(variances: FloatArray, d2: FloatArray) -> FloatArray:
-    """Log-likelihoods (K, N) of hypotheses but for a constant: variances (K, 2, N), squares of distances d2 (2, N)."""
-    return np.asarray(-(np.log(variances) + d2 / variances).sum(axis=1) / 2)
 
 
 def _posteriors(log: FloatArray, shares: FloatArray) -> FloatArray:
@@ -467,7 +401,6 @@ def _shares_of_traffic(log: FloatArray, time: FloatArray, judged: BoolArray) -> 
 def _place(record: Sequence[RecordedEpoch], path: FloatArray, settings: JointSettings) -> _PlacedDetections:
     row = np.repeat(np.arange(len(record)), [len(now.seen.id) for now in record]).astype(np.int64)
     place = [transform_points(pose, now.seen.z)[:, :2] for now, pose in zip(record, path, strict=True)]
-    sight = [one - pose[:2, 3] for one, pose in zip(place, path, strict=True)]
     label = [now.objects.label[np.isin(now.objects.id, now.seen.id)] for now in record]
     P = motion_covariances(record, settings)
     drift = np.zeros((len(record), 3))
@@ -479,7 +412,6 @@ def _place(record: Sequence[RecordedEpoch], path: FloatArray, settings: JointSet
         row,
         np.array([now.time for now in record])[row],
         np.concatenate(place),
-        np.concatenate(sight),
         np.concatenate([np.trace(now.seen.R, axis1=1, axis2=2) / 2 for now in record]),
         np.concatenate([np.hypot(now.seen.z[:, 0], now.seen.z[:, 1]) for now in record]),
         class_numbers(settings.moving_speed, float, np.concatenate(label)),

@@ -6,22 +6,20 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from benchmarks.joint import OnlineEstimator
-from factors import prior_factor
 from saga_fg import Boxes, Detections, Frame, InputError, Sensor, Tracker, TrackerSettings
-from saga_fg.graph import EGO_VELOCITY, Additions, GraphView, NewVariable
+from saga_fg.graph import EGO_ERROR
 from saga_fg.model import CoordinatedTurn, NoiseModel, PoleLandmark
 from saga_fg.numerics import inverse_transform, yaw_transform
+from saga_fg.providers import Odometry, OdometryNoise, StartSettings
 from saga_fg.slam.joint import (
     JointSettings,
     OdometryIncrements,
-    OdometryNoise,
     estimate_jointly,
 )
 from saga_fg.slam.joint.record import record_epochs, stationary_probabilities
 from saga_fg.slam.mapping import LandmarkObservations
-from saga_fg.tracking import AssociationSettings, ClassSettings
-from saga_fg.types import DEFAULT, Observation
+from saga_fg.tracking import AssociationSettings, ClassSettings, EgoNodeSettings
+from saga_fg.types import Observation
 from tests.saga_fg.ego_drive import NOISE, drive, new_tracker
 
 POOR = OdometryNoise(scale=0.02, bias=0.005)
@@ -175,13 +173,10 @@ def test_a_queue_that_creeps_does_not_pass_for_parked():
     for time, pose in zip(t, poses, strict=True):
         frames.append(frame_at(time, pose, Boxes.of(["car"] * 2, [[45.0 + 1.2 * time, 0.0, 1.0], [8.0, 6.0, 1.0]])))
     record, settings = record_epochs(frames, poses, OdometryIncrements.of(t, poses), new_tracker()), JointSettings(POOR)
-    slow = settings.odometry.slow
-    batch, online = (stationary_probabilities(record, poses, slow, settings, online)[-1] for online in (False, True))
+    batch = stationary_probabilities(record, poses, settings.odometry.slow, settings)[-1]
     creeps, parked = [int(np.argmin(abs(record[-1].seen.z[:, 1] - y))) for y in (0.0, 6.0)]
     assert batch[creeps] < 0.9
     assert batch[parked] > 0.9
-    assert online[creeps] < 0.5
-    assert online[parked] > 0.8
 
 
 def test_frames_and_odometry_must_fit():
@@ -213,107 +208,39 @@ def test_poles_correct_the_odometry_where_nothing_else_stands():
     assert joint.max() < min(0.2, alone.max() / 3)
 
 
-# The vehicle, landmarks and objects online: what a window loses against the batch, and what it must not
-
 SETTINGS = JointSettings(POOR)
 
 
-def rms(found, poses):
-    return np.sqrt(np.mean(off_path(found, poses) ** 2))
-
-
-def online(frames, odometry, estimator):
-    """The newest pose and its covariance at every frame."""
-    steps = [estimator.step(frame, odometry.a_T_b[k - 1] if k else None) for k, frame in enumerate(frames)]
-    poses = np.array([step.world_T_ego[-1] for step in steps])
-    return poses, np.array([step.pose_covariances[-1] for step in steps])
-
-
-def test_a_window_of_seconds_is_nearly_the_batch():
-    frames, odometry, poses, _ = drive(n=35)
-    reported = worse(odometry, np.random.default_rng(1))
-    batch = estimate_jointly(frames, reported, new_tracker, SETTINGS, poses[0])
-    newest, covariances = online(frames, reported, OnlineEstimator(new_tracker(), 2.0, SETTINGS, start=poses[0]))
-    assert rms(newest, poses) < rms(reported.path(poses[0]), poses) / 3
-    P = covariances[-1]
-    np.testing.assert_allclose(np.sqrt(np.diag(P)), np.sqrt(np.diag(batch.pose_covariances[-1])), rtol=0.1)
-    errors = np.array([inverse_transform(f) @ p for f, p in zip(newest, poses, strict=True)])
-    planar = np.stack([errors[:, 1, 0], errors[:, 0, 3], errors[:, 1, 3]], axis=1)
-    squares = [e @ np.linalg.solve(P[2:5, 2:5], e) for e, P in zip(planar, covariances, strict=True)]
-    assert np.mean(squares[5:]) < chi2.ppf(0.999, 3)
-
-
-def test_variables_of_providers_leave_the_window_with_their_epoch():
-    frames, odometry, poses, _ = drive(n=12)
-    estimator = OnlineEstimator(new_tracker(), 1.0, SETTINGS, start=poses[0], providers=[_Speeds()])
+def online_path(frames, odometry, poses, provider):
+    """The path by a tracker that estimates its pose, with what stands beside the road."""
+    settings = replace(new_tracker().settings, estimator="isam2", ego=EgoNodeSettings(estimated=True))
+    tracker, path = Tracker(replace(settings, stationary_share=0.5), new_tracker().sensors, providers=[provider]), []
     for k, frame in enumerate(frames):
-        estimator.step(frame, odometry.a_T_b[k - 1] if k else None)
-    graph, window = estimator._smoother.graph(), estimator._record
-    assert all(graph.of(EGO_VELOCITY, now.epoch) for now in window)
-    assert not any(graph.of(EGO_VELOCITY, k) for k in range(window[0].epoch))
+        measured = EgoMeasurements(odometry=OdometryIncrement(odometry.a_T_b[k - 1], odometry.dt[k - 1]) if k else None)
+        tracker.step(replace(frame, world_T_ego=None, ego=measured))
+        path.append(tracker.world_T_ego)
+    return np.array(path), tracker
 
 
-class _Speeds:
-    """A variable of its own at every epoch."""
-
-    name = "speeds"
-
-    def factors(self, view: GraphView) -> Additions:
-        assert view.frame is not None
-        prior = prior_factor(view.key(EGO_VELOCITY, 0), np.zeros(3), np.eye(3))
-        return Additions([NewVariable(EGO_VELOCITY, 0, np.zeros(3))], [prior])
-
-
-def test_what_leaves_the_window_stays_in_the_prior():
-    """In a nearly linear problem a short window gives the newest pose and covariance of a long one."""
-    frames, odometry, poses, _ = drive(n=14, parked=0, moving=3)
-    reported = worse(odometry, np.random.default_rng(2))
-    linear = replace(SETTINGS, outlier_scale=np.inf, moving_speed={DEFAULT: 1e-6})  # nobody stands, no robust loss
-    (short, P_short), (long, P_long) = (
-        online(frames, reported, OnlineEstimator(new_tracker(), lag, linear, start=poses[0])) for lag in (0.5, 60.0)
-    )
-    sigma = np.sqrt(np.diag(P_long[-1]))[3:5]
-    assert (np.abs((short - long)[-1, :2, 3]) < 0.1 * sigma).all()
-    np.testing.assert_allclose(P_short[-1], P_long[-1], rtol=0.02, atol=1e-6)
+def test_slow_errors_of_the_odometry_are_found_online():
+    frames, odometry, poses, _ = drive(n=40)
+    reported = worse(odometry, np.random.default_rng(1), scale=0.06)
+    x, y, _ = poses[0, :3, 3]
+    start = StartSettings((x, y, 0.0), deviation=1e-3, heading_deviation=1e-3, tilt_deviation=1e-3, planar=False)
+    noise = replace(POOR, scale=0.06)
+    path, tracker = online_path(frames, reported, poses, Odometry(start, errors=noise))
+    plain, _ = online_path(frames, reported, poses, Odometry(start))
+    alone = off_path(reported.path(poses[0]), poses)[-1]
+    assert off_path(path, poses)[-1] < min(alone / 4, off_path(plain, poses)[-1])
+    graph = tracker.running_graph
+    scale, bias, _ = graph.state(graph.of(EGO_ERROR, graph.epoch)[0].key)
+    assert scale == pytest.approx(0.06, abs=0.01)
+    assert bias == pytest.approx(-0.004, abs=0.004)
 
 
-def test_the_window_holds_the_lag():
-    frames, odometry, poses, _ = drive(n=9)
-    estimator = OnlineEstimator(new_tracker(), 0.6, SETTINGS, start=poses[0])
-    for k, frame in enumerate(frames):
-        step = estimator.step(frame, odometry.a_T_b[k - 1] if k else None)
-        assert step.timestamps.tolist() == [frame.timestamp]
-        assert frame.timestamp - estimator.window().timestamps[0] < 0.6 + 0.2 + 1e-9
-    assert estimator.window().object_covariances(0).shape[1:] == (4, 4)
-
-
-def test_what_cannot_be_is_refused():
-    with pytest.raises(InputError, match="lag: expected a finite number"):
-        OnlineEstimator(new_tracker(), -1.0)
-    estimator = OnlineEstimator(new_tracker(), 1.0)
-    with pytest.raises(InputError, match="expected a frame before"):
-        estimator.window()
-    frames, *_ = drive(n=3)
-    estimator.step(frames[1])
-    with pytest.raises(InputError, match="expected one after"):
-        estimator.step(frames[0], np.eye(4))
-
-
-def test_a_motion_that_is_none_does_not_reach_the_graph(subtests):
-    for motion, covariance, message in [
-        (None, None, "a_T_b: expected the motion since the last frame"),
-        (np.full((4, 4), np.nan), None, "expected a finite number"),
-        (2 * np.eye(4), None, "a_T_b: expected a rigid"),
-        (np.eye(4), -np.eye(6), "covariance"),
-    ]:
-        with subtests.test(message):
-            frames, odometry, *_ = drive(n=3)
-            estimator = OnlineEstimator(new_tracker(), 1.0, SETTINGS)
-            estimator.step(frames[0])
-            with pytest.raises(InputError, match=message):
-                estimator.step(frames[1], motion, covariance)
-            estimator.step(frames[1], odometry.a_T_b[0])  # and leaves the estimator as it was
-            assert len(estimator.window().world_T_ego) == 2
+def test_errors_need_poses_in_space():
+    with pytest.raises(InputError, match="errors: expected poses in space"):
+        Odometry(errors=POOR)
 
 
 # Uncertain identity and motion of objects beside a vehicle whose path is estimated
@@ -349,10 +276,6 @@ def test_a_wrong_association_does_not_bend_the_path():
     right, wrong = (estimate_jointly(frames, odometry, new, SETTINGS, poses[0]) for new in (new_tracker, confused))
     off = [off_path(one.world_T_ego, poses).max() for one in (right, wrong)]
     assert off[1] < off[0] + 0.1
-    estimator = OnlineEstimator(confused(), 3.0, SETTINGS, start=poses[0])
-    for k, frame in enumerate(frames):
-        step = estimator.step(frame, odometry.a_T_b[k - 1] if k else None)
-    assert np.linalg.norm((step.world_T_ego[-1] - poses[-1])[:2, 3]) < off[0] + 0.3
 
 
 def test_objects_say_how_probably_they_are_stationary():
@@ -361,11 +284,6 @@ def test_objects_say_how_probably_they_are_stationary():
     middle = estimate.objects[len(poses) // 2]
     nearest = np.linalg.norm(middle.position[:, None] - cars[len(poses) // 2][None], axis=2).argmin(axis=1)
     np.testing.assert_array_equal(middle.stationary > 0.5, nearest < 6)
-    estimator = OnlineEstimator(new_tracker(), 3.0, SETTINGS, start=poses[0])
-    for k, frame in enumerate(frames):
-        last = estimator.step(frame, odometry.a_T_b[k - 1] if k else None).objects[-1]
-    assert (last.stationary > 0.5).sum() >= 3
-    assert (last.stationary[np.hypot(*last.velocity.T) > 3] < 0.1).all()
 
 
 def convoy(common: float, n: int = 40) -> tuple[list[Frame], OdometryIncrements, np.ndarray]:

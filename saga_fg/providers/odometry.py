@@ -1,0 +1,234 @@
+"""Providers of the vehicle's own motion: first pose, and odometry, with its slow errors where these are estimated.
+
+The vehicle's pose from epoch to epoch, by odometry.
+
+    r = log( measured^-1 before^-1 now ),    measured = before_T_now of the interval
+
+An increment over other times than the epoch's is taken for a steady motion, of which the epoch has its share: the
+motion's logarithm times the share, its covariance as well. Without an increment the vehicle may be anywhere nearby.
+
+A device with slow errors, a scale of the distance, a bias of the yaw rate and an angle of the course, has these as
+variables of their own (`factors.odometry_factors`). An increment of dt s and d m has independent noise
+
+    heading      turn_noise^2 dt                     roll, pitch   tilt_noise^2 dt
+    translation  distance_noise^2 d + time_noise^2 dt,  every direction
+
+and the slow errors start as N(0, scale^2), N(0, bias^2), N(0, course^2) and wander as random walks. What stands still
+beside the vehicle tells them.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from factors import ERROR_DIM, Pose, between_factor, odometry_factors, pose, pose_prior_factor, prior_factor
+from saga_fg.errors import InputError
+from saga_fg.graph import EGO_ERROR, EGO_POSE, Additions, GraphView, NewVariable
+from saga_fg.numerics import FloatArray, yaw_of, yaw_transform
+from saga_fg.settings import Positive, Settings, setting, settings_group
+from saga_fg.types import Frame, OdometryIncrement
+
+NO_POSE = "expected a provider that adds the vehicle's pose before it, such as saga_fg.providers:Odometry"
+
+
+@dataclass(frozen=True)
+class StartSettings(Settings):
+    """The vehicle's first pose."""
+
+    place: tuple[float, float, float] | None = setting(
+        None, "x, y (m) and yaw (rad) in the world; null: world_T_ego of the first frame, else its GPS fix and yaw 0"
+    )
+    deviation: Positive = setting(1.0, "standard deviation of the position, m")
+    heading_deviation: Positive = setting(0.1, "standard deviation of the heading, rad")
+    tilt_deviation: Positive = setting(0.02, "standard deviation of roll and pitch of poses in space, rad")
+    planar: bool = setting(True, "true: poses (x, y, heading), gtsam.Pose2; false: poses in space, gtsam.Pose3")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.place is not None and not all(map(math.isfinite, self.place)):
+            raise InputError(f"place: expected finite numbers, got {self.place!r}")
+
+    def additions(self, view: GraphView) -> Additions:
+        """The first pose with its prior; none where the vehicle has a pose already."""
+        if view.now(EGO_POSE) or view.before(EGO_POSE):
+            return Additions()
+        world_T_ego = self.transform(view.frame)
+        world_T_ego[:2, 3] -= view.origin
+        if self.planar:
+            start: Pose = gtsam.Pose2(float(yaw_of(world_T_ego[:3, :3])), world_T_ego[:2, 3])
+            sigmas = [self.deviation, self.deviation, self.heading_deviation]
+        else:
+            start = pose("start", world_T_ego)
+            sigmas = [self.tilt_deviation, self.tilt_deviation, self.heading_deviation] + 3 * [self.deviation]
+        prior = pose_prior_factor(view.key(EGO_POSE, 0), start.matrix(), np.diag(np.square(sigmas)))
+        return Additions([NewVariable(EGO_POSE, 0, start, label="vehicle")], [prior])
+
+    def transform(self, frame: Frame | None) -> FloatArray:
+        """world_T_ego (4, 4) as settings or a frame have it."""
+        if self.place is not None:
+            x, y, yaw = self.place
+            return yaw_transform(x, y, 0.0, yaw)
+        if frame is not None and frame.world_T_ego is not None:
+            return frame.world_T_ego.copy()
+        start = np.eye(4)
+        if frame is not None and frame.ego is not None and frame.ego.gps is not None:
+            place = frame.ego.gps.position
+            start[: len(place), 3] = place
+        return start
+
+
+@dataclass(frozen=True)
+class OdometryNoise(Settings):
+    """Noise of an odometry: standard deviations."""
+
+    turn_noise: Positive = setting(0.01, "standard deviation of the heading after one second, rad")
+    tilt_noise: Positive = setting(0.001, "standard deviation of roll and pitch after one second, rad")
+    distance_noise: Positive = setting(0.03, "standard deviation of the translation after one metre, m")
+    time_noise: Positive = setting(0.01, "standard deviation of the translation after one second, m")
+    scale: Positive = setting(0.02, "standard deviation of the scale of distances at the start")
+    scale_drift: Positive = setting(0.002, "random walk of the scale in one second")
+    bias: Positive = setting(0.005, "standard deviation of the yaw-rate bias at the start, rad/s")
+    bias_drift: Positive = setting(0.0005, "random walk of the yaw-rate bias in one second, rad/s")
+    course: Positive = setting(0.01, "standard deviation of the course against the sensor axes at the start, rad")
+    course_drift: Positive = setting(0.0003, "random walk of that course in one second, rad")
+
+    @property
+    def slow(self) -> FloatArray:
+        """Deviations (3,) of scale, bias (rad/s) and course (rad) at the start, before any measurement."""
+        return np.array([self.scale, self.bias, self.course])
+
+    def covariances(self, distance: FloatArray, dt: FloatArray) -> FloatArray:
+        """(n, 9, 9) of increments over `distance` (n,) m and `dt` (n,) s > 0.
+
+        Rows: rotation (rad), translation in the frame of the earlier pose (m), change of scale, of bias (rad/s), of
+        course (rad).
+        """
+        tilt, turn = self.tilt_noise**2 * dt, self.turn_noise**2 * dt
+        shift = self.distance_noise**2 * distance + self.time_noise**2 * dt
+        slow = (self.scale_drift**2 * dt, self.bias_drift**2 * dt, self.course_drift**2 * dt)
+        variances = np.stack([tilt, tilt, turn, shift, shift, shift, *slow], axis=1)
+        return np.asarray(variances[:, :, None] * np.eye(6 + ERROR_DIM))
+
+    def of_increments(self, a_T_b: FloatArray, dt: FloatArray, stated: Sequence[FloatArray | None]) -> FloatArray:
+        """(n, 9, 9) of increments a_T_b (n, 4, 4) over dt (n,) s, as of `covariances`.
+
+        stated: for each the covariance (6, 6) that the device states, (rotation vector, translation) in the frame of
+        the later pose, rad^2, m^2, which holds in place of that noise; None for none
+        """
+        P = self.covariances(np.linalg.norm(a_T_b[:, :3, 3], axis=1), dt)
+        for row, covariance in enumerate(stated):
+            if covariance is not None:
+                axes = np.eye(6)
+                axes[3:, 3:] = a_T_b[row, :3, :3]
+                P[row, :6, :6] = axes @ covariance @ axes.T
+        return P
+
+
+def without_errors(a_T_b: FloatArray, errors: FloatArray, dt: float) -> FloatArray:
+    """The motion (4, 4) that a device with slow errors (3,) has reported as a_T_b (4, 4) over `dt` s."""
+    scale, bias, course = errors
+    motion = yaw_transform(yaw=-bias * dt) @ a_T_b
+    motion[:3, 3] = yaw_transform(yaw=-course)[:3, :3] @ a_T_b[:3, 3] / (1 + scale)
+    return motion
+
+
+_SAME = 1e-4  # relative difference of two intervals that timestamps make
+UNKNOWN_SPEED = 10.0  # standard deviation of the velocity where there is no increment, m/s
+UNKNOWN_TURN = 0.3  # standard deviation of the turn rate where there is no increment, rad/s
+
+
+@dataclass(frozen=True)
+class Odometry(Settings):
+    """Adds the vehicle's pose at every epoch, and the increments of odometry (`frame.ego.odometry`).
+
+    Raises `InputError` for `errors` with poses in the plane.
+    """
+
+    start: StartSettings = settings_group(StartSettings, "first pose")
+    place_drift: Positive = setting(
+        0.1, "standard deviation of the position after one second, for increments without a covariance, m"
+    )
+    heading_drift: Positive = setting(
+        0.01, "standard deviation of heading, roll and pitch after one second, likewise, rad"
+    )
+    errors: OdometryNoise | None = settings_group(
+        lambda: None, "noise of a device whose slow errors are estimated, of poses in space; null: none are"
+    )
+    name = "odometry"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.errors is not None and self.start.planar:
+            raise InputError("errors: expected poses in space, start.planar: false")
+
+    def predict(self, view: GraphView) -> Additions:
+        before = view.before(EGO_POSE)
+        if not before:
+            return self._begun(view)
+        last, key = before[0].key, view.key(EGO_POSE, 0)
+        planar = isinstance(view.state(last), gtsam.Pose2)
+        motion, covariance = self._motion(view, planar)
+        if self.errors is not None:
+            return self._with_errors(view, self.errors, motion.matrix(), covariance)
+        assert covariance is not None
+        new = (
+            [] if view.now(EGO_POSE) else [NewVariable(EGO_POSE, 0, view.state(last).compose(motion), label="vehicle")]
+        )
+        return Additions(new, [between_factor(last, key, motion.matrix(), covariance)])
+
+    def factors(self, view: GraphView) -> Additions:
+        return Additions()
+
+    def _begun(self, view: GraphView) -> Additions:
+        """The first pose, with the errors where they are estimated."""
+        first = self.start.additions(view)
+        if self.errors is None or not first.variables:
+            return first
+        errors = NewVariable(EGO_ERROR, 0, np.zeros(ERROR_DIM))
+        prior = prior_factor(view.key(EGO_ERROR, 0), errors.state, np.diag(np.square(self.errors.slow)))
+        return Additions([*first.variables, errors], [*first.factors, prior])
+
+    def _with_errors(
+        self, view: GraphView, noise: OdometryNoise, a_T_b: FloatArray, covariance: FloatArray | None
+    ) -> Additions:
+        last, slow = view.before(EGO_POSE)[0].key, view.before(EGO_ERROR)[0].key
+        errors, dt = np.asarray(view.state(slow)), np.array([view.dt])
+        pose = view.state(last).compose(gtsam.Pose3(without_errors(a_T_b, errors, view.dt)))
+        new = [NewVariable(EGO_POSE, 0, pose, label="vehicle"), NewVariable(EGO_ERROR, 0, errors)]
+        rows = np.array([[last, view.key(EGO_POSE, 0), slow, view.key(EGO_ERROR, 0)]], dtype=np.uint64)
+        P = noise.of_increments(a_T_b[None], dt, [covariance])
+        return Additions(new, [odometry_factors(rows, a_T_b[None], dt, P)])
+
+    def _motion(self, view: GraphView, planar: bool) -> tuple[Pose, FloatArray | None]:
+        """Motion of this epoch, with the covariance of its tangent; None where that of `errors` holds."""
+        ego = None if view.frame is None else view.frame.ego
+        if ego is None or ego.odometry is None:
+            stationary: Pose = gtsam.Pose2() if planar else gtsam.Pose3()
+            return stationary, self._covariance(UNKNOWN_SPEED * view.dt, UNKNOWN_TURN * view.dt, planar)
+        reported = ego.odometry
+        motion = _motion_of(reported, planar)
+        covariance = reported.covariance
+        if covariance is None and self.errors is None:
+            covariance = self._covariance(self.place_drift, self.heading_drift, planar) * reported.dt
+        share = view.dt / reported.dt
+        if abs(share - 1) <= _SAME:
+            return motion, covariance
+        still: Any = type(motion)()
+        scaled = None if covariance is None else share * max(share, 1.0) * covariance
+        return still.expmap(share * still.logmap(motion)), scaled
+
+    def _covariance(self, place: float, heading: float, planar: bool) -> FloatArray:
+        sigmas = [place, place, heading] if planar else 3 * [heading] + 3 * [place]
+        return np.diag(np.square(sigmas))
+
+
+def _motion_of(reported: OdometryIncrement, planar: bool) -> Pose:
+    wanted = 3 if planar else 4
+    if len(reported.before_T_now) != wanted:
+        n = len(reported.before_T_now)
+        raise InputError(f"odometry: expected a {wanted} x {wanted} transform, as poses are, got {n} x {n}")
+    return pose("odometry", reported.before_T_now)
