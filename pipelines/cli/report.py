@@ -14,7 +14,7 @@ from pipelines.cli import options
 from pipelines.cli.console import working
 from pipelines.cli.options import dataset_commands
 from pipelines.explaining import journal_of, read_graphs
-from pipelines.report import report_page, result_report
+from pipelines.report import drive_page, report_page, result_report
 from saga_fg.errors import InputError
 
 
@@ -33,11 +33,15 @@ def _report(
 ) -> None:
     """Make a page of a tracking result: a player, charts, and figures, of errors where there is ground truth."""
     options.apart(output, result, *([] if beside is None else [beside]), *input_files(source))
+    _write_page(output, lambda: report_page(result_report(source, result, beside, images)))
+
+
+def _write_page(output: Path, make: Callable[[], str]) -> None:
     if output.suffix not in (".html", ".htm"):
         raise InputError(f"{output}: expected a file name that ends in .html")
     check_writable(output)
     with working("making the page"):
-        page = report_page(result_report(source, result, beside, images))
+        page = make()
         write_text(output, page)
     typer.echo(f"{output}: {len(page) / 1e6:.1f} MB")
 
@@ -49,6 +53,22 @@ report_app = dataset_commands(
     ("report {result} --output report.html", "report {result} --beside other/{tracks} --output report.html"),
     lambda source: {} if "images" in source.shows else {"images": None},
 )
+
+
+@report_app.command("slam")
+def report_slam(
+    result: Annotated[Path, typer.Argument(help="Folder that `saga-fg slam scans` wrote.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="HTML file to write.")],
+    verbose: options.Verbose = False,
+) -> None:
+    """Make a page of a run of SLAM: path over map, drift along the way, errors, loops, open motions.
+
+    \b
+    Example:
+      saga-fg report slam slam --output drive.html
+    """
+    _write_page(output, lambda: drive_page(result))
+
 
 Save = Annotated[
     Path | None,
@@ -125,7 +145,7 @@ def _show(
             drawings.append(view.draw_slam(driven, root, origin))
         roots = roots or ["slam"]
         if save is None:
-            view.show_rerun(result.name, roots, view.in_order(*drawings))
+            view.RerunViewer(result.name, roots).draw(view.in_order(*drawings))
         else:
             view.write_view(save, result.name, roots, view.in_order(*drawings))
     if save is not None:

@@ -11,7 +11,7 @@ import typer
 
 from data_tools.files import check_writable_folder
 from data_tools.laser import read_carmen
-from data_tools.lidar import PERIOD, ScanSequence
+from data_tools.lidar import PERIOD, Scan, ScanSequence
 from data_tools.pose_graphs import read_g2o
 from data_tools.recordings import LAYOUTS, RecordingOptions, ScanRecording, is_bag, open_recording, read_bag_laser
 from data_tools.sensor_logs import SensorLog
@@ -20,6 +20,7 @@ from pipelines.cli.console import counted, new_group, progress_bar, working
 from pipelines.cli.options import Config, Verbose, as_command
 from pipelines.slam.configuration import load_slam_config, sensor_log
 from pipelines.slam.drive import Origin, SlamMap, read_map
+from pipelines.slam.driver import Slam, SlamStep
 from pipelines.slam.laser_slam import laser_slam
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam, path_tracker, with_objects
 from pipelines.slam.localisation import LocaliserSettings, localise
@@ -31,6 +32,7 @@ from pipelines.slam.results import (
     write_merged,
     write_pose_graph,
 )
+from pipelines.view import RerunViewer, draw_slam_step, load_rerun
 from saga_fg import InputError
 from saga_fg.errors import error_context
 from saga_fg.numerics import IntArray, yaw_transform
@@ -160,6 +162,7 @@ def scans(
     drive: DriveOptions,
     logged: LoggedOptions,
     earlier: MapOptions,
+    live: Annotated[bool, typer.Option("--view", help="Show path and map in rerun's viewer (extra [view]).")] = False,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -188,6 +191,10 @@ def scans(
       saga-fg slam scans data/kitti --sequence 0000 --objects --output slam
       saga-fg slam scans data/kitti_odometry --sequence 07 --output slam
     """
+    if live and earlier.known_map is not None:
+        raise InputError("--view: expected without --map")
+    if live:
+        load_rerun()
     if drive.detections is not None and not drive.objects:
         raise InputError("--detections: expected with --objects only")
     if earlier.known_map is None and earlier.guess is not None:
@@ -232,6 +239,12 @@ def scans(
     if slam_map is not None:
         _localise(recording, slam_map, earlier.guess, slam.localisation, output, log)
         return
+    viewer = RerunViewer(output.name, ["slam"]) if live else None
+
+    def watch(slam: Slam, scan: Scan, time: float, step: SlamStep) -> None:
+        if viewer is not None:
+            viewer.draw(draw_slam_step(slam, scan, time, step))
+
     with progress_bar(unit="scans") as progress:
         lidar = replace(slam.lidar, landmarks=slam.lidar.landmarks and drive.landmarks)
         result = lidar_slam(
@@ -242,6 +255,7 @@ def scans(
             detectors=slam.new_detectors(),
             log=log,
             objects=(frames, path_tracker(settings)) if drive.objects else None,
+            watch=watch,
         )
     if drive.objects:
         with working("objects"):

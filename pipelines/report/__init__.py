@@ -3,6 +3,7 @@
 result + recordings -> `ReportScene`s, tables, charts -> `report_page` -> one file
 """
 
+from pipelines.report.drive import drive_page
 from pipelines.report.figures import latency_chart
 from pipelines.report.page import (
     Report,
@@ -19,6 +20,7 @@ __all__ = [
     "Report",
     "ReportScene",
     "RunRecord",
+    "drive_page",
     "latency_chart",
     "read_run_record",
     "record_path",

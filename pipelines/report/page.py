@@ -80,23 +80,24 @@ def report_page(report: Report) -> str:
         "review": report.review,
     }
     configuration = f"<pre>{html.escape(report.configuration)}</pre>" if report.configuration else ""
-    page = _part("page.html")
+    page = page_part("page.html")
     for mark, text in (
         ("TITLE", html.escape(report.title)),
         ("FACTS", "".join(f"<li>{html.escape(fact)}</li>" for fact in report.facts)),
         ("NOTES", "".join(f"<p>{html.escape(note)}</p>" for note in report.notes)),
-        ("TABLES", "".join(map(_table, report.tables))),
+        ("TABLES", "".join(map(table_html, report.tables))),
         ("CONFIGURATION", configuration),
-        ("STYLE", _part("page.css")),
+        ("STYLE", page_part("page.css")),
         ("DATA", _packed(data)),
         ("CONNECT", "; connect-src 'self'" if report.review and report.review["server"] else ""),
-        ("SCRIPT", "".join(_part(f"{name}.js") for name in SCRIPTS if report.review or name != "review")),
+        ("SCRIPT", "".join(page_part(f"{name}.js") for name in SCRIPTS if report.review or name != "review")),
     ):
         page = page.replace(f"<!--{mark}-->", text)
     return page
 
 
-def _part(name: str) -> str:
+def page_part(name: str) -> str:
+    """Text of a file of the page."""
     return (files("pipelines.report") / name).read_text(encoding="utf-8")
 
 
@@ -105,7 +106,8 @@ def _packed(data: Any) -> str:
     return base64.b64encode(zlib.compress(text.encode(), 9)).decode("ascii")
 
 
-def _table(table: FigureTable) -> str:
+def table_html(table: FigureTable) -> str:
+    """A table of a page."""
     head = "".join(f"<th>{html.escape(column)}</th>" for column in table.columns)
     body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in table.rows)
     return (

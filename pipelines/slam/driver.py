@@ -277,6 +277,15 @@ class Slam:
         number = len(self._path.keyframes) - 1 if placed.keyframe else None
         return SlamStep(self._online[-1], now, placed, number, submap, tuple(self._submaps.loops[known:]))
 
+    @property
+    def submaps(self) -> Sequence[Submap]:
+        """The submaps that are closed."""
+        return self._submaps.closed
+
+    def keyframe(self, number: int) -> FloatArray:
+        """The pose (4, 4) of a keyframe, as estimated now."""
+        return self._graph.pose(number)
+
     def finish(self) -> SlamResult:
         """Close the last submap, and solve everything together."""
         if not self._path.keyframes:

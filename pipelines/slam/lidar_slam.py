@@ -17,11 +17,11 @@ from functools import partial
 
 import numpy as np
 
-from data_tools.lidar import ScanSequence, extract_poles, extract_walls, scan_context, segment_ground
+from data_tools.lidar import Scan, ScanSequence, extract_poles, extract_walls, scan_context, segment_ground
 from data_tools.sensor_logs import SensorLog
 from data_tools.trajectories import Trajectory
 from pipelines.config import TrackConfig
-from pipelines.slam.driver import FrontEnd, MovingObjects, Slam, SlamResult
+from pipelines.slam.driver import FrontEnd, MovingObjects, Slam, SlamResult, SlamStep
 from pipelines.slam.loop_closures import LoopSearch, LoopSettings, PlaceLoops
 from pipelines.slam.odometry import LidarOdometry, Odometry, OdometrySettings
 from pipelines.slam.vehicle_sensors import Vehicle, start_by_fixes
@@ -130,13 +130,15 @@ def lidar_slam(
     odometry: Odometry | None = None,
     log: SensorLog | None = None,
     objects: tuple[Sequence[Frame], Tracker] | None = None,
+    watch: Callable[[Slam, Scan, float, SlamStep], None] | None = None,
 ) -> SlamResult:
     """Estimate everything from K >= 2 scans of a recording, one after the other. The only pose of the recording that
     counts is the first. Without poses the world is the vehicle's frame at the first
     scan, or that of the fixes by GPS, if there are any: the first scans then tell which way it looks.
 
     providers, detectors, odometry: as of `LidarSlam`; log: of the vehicle's sensors, in the recording's world; objects:
-    frames with detections at the times of all scans, and a new tracker: moving objects leave the scans.
+    frames with detections at the times of all scans, and a new tracker: moving objects leave the scans; watch: called
+    with each scan, its time since the first, s, and where it was placed.
     Raises `InputError` for a scan without a frame.
     """
     s = settings or LidarSlamSettings()
@@ -161,7 +163,10 @@ def lidar_slam(
     for k, (time, ego) in enumerate(log.until(scans.timestamps)):
         detections = None if (frame := seen[k]) is None else frame.detections
         with scan_context(scans, k):
-            slam.step(scans[k], time, imu=ego.imu, gps=ego.gps, detections=detections, wheels=ego.wheels)
+            scan = scans[k]
+            step = slam.step(scan, time, imu=ego.imu, gps=ego.gps, detections=detections, wheels=ego.wheels)
+        if watch is not None:
+            watch(slam, scan, time - float(scans.timestamps[0]), step)
         if progress is not None:
             progress("slam", k + 1, len(scans))
     return slam.finish()

@@ -10,23 +10,25 @@ from pipelines.view.scenes import (
     SlamView,
     draw_scene,
     draw_slam,
+    draw_slam_step,
     in_order,
     read_slam_view,
     result_views,
 )
-from pipelines.view.writers import check_view_file, load_rerun, show_rerun, write_view
+from pipelines.view.writers import RerunViewer, check_view_file, load_rerun, write_view
 
 __all__ = [
     "Drawing",
+    "RerunViewer",
     "SceneView",
     "SlamView",
     "check_view_file",
     "draw_scene",
     "draw_slam",
+    "draw_slam_step",
     "in_order",
     "load_rerun",
     "read_slam_view",
     "result_views",
-    "show_rerun",
     "write_view",
 ]

@@ -46,11 +46,12 @@ import numpy as np
 from data_tools.datasets.source import DatasetSource
 from data_tools.figures import COLOURS, class_colours
 from data_tools.files import parsed_json, read_bytes
-from data_tools.lidar import ScanSequence, read_scan, voxel_downsample
+from data_tools.lidar import Scan, ScanSequence, read_scan, voxel_downsample
 from data_tools.metrics import SceneBoxes
 from data_tools.trajectories import Trajectory, read_tum_poses
 from pipelines.report.page import result_scenes
 from pipelines.report.scenes import UNMEASURED, Edges, ReportScene, edges_of_frames, latest_detections
+from pipelines.slam.driver import Slam, SlamStep
 from saga_fg import Boxes, InputError
 from saga_fg.numerics import FloatArray, IntArray, checked
 
@@ -381,6 +382,28 @@ def draw_slam(view: SlamView, root: str, origin: FloatArray | None = None) -> It
         pose = world_T_ego.copy()
         pose[:3, 3] -= origin
         yield Drawing(root, "pose", Pose(pose), time)
+
+
+_LIVE = 0.3  # m, spacing of the points of a scan and a submap that are drawn while SLAM runs
+
+
+def draw_slam_step(slam: Slam, scan: Scan, time: float, step: SlamStep) -> Iterator[Drawing]:
+    """Draw a scan that `slam` has just placed, `time` s after the first: pose, points, the submap that it closed, and
+    loops, which move all submaps."""
+    place, submaps = step.world_T_lidar[None, :3, 3], slam.submaps
+    yield Drawing("slam", "pose", Pose(step.world_T_lidar), time)
+    yield Drawing("slam/pose", "scan", Points(scan.points[voxel_downsample(scan.points, _LIVE)], SEEN, 0.05), time)
+    yield Drawing("slam", f"path/{time:.3f}", Points(place, PATHS["online"], 0.15), time)
+    if step.submap is not None:
+        points = step.submap.points.astype(np.float64)
+        shown = Points(points[voxel_downsample(points, _LIVE)], MAP, 0.03)
+        yield Drawing(f"slam/submap {len(submaps) - 1}", "points", shown, time)
+        for number, submap in enumerate(submaps):
+            world_T_submap = slam.keyframe(submap.keyframes[0]) @ submap.anchor_T_submap
+            yield Drawing("slam", f"submap {number}", Pose(world_T_submap), time)
+    for loop in step.loops:
+        ends = np.array([slam.keyframe(k)[:3, 3] for k in (loop.first, loop.second)])
+        yield Drawing("slam", f"loops/{loop.first}-{loop.second}", Lines([ends], EDGE, np.array([0.1])), time)
 
 
 def _named(path: Path) -> tuple[tuple[str, ...], FloatArray]:

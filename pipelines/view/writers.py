@@ -211,13 +211,17 @@ def _flushed(stream: Any, path: Path) -> None:
         raise InputError(f"{path}: not written, is the disk full? {error}") from error
 
 
-def show_rerun(name: str, roots: Sequence[str], drawings: Iterable[Drawing]) -> None:
-    """Open rerun's viewer on the screen and draw there; it stays open. Otherwise as `write_rerun`."""
-    rerun = load_rerun()
-    stream = rerun.RecordingStream(APPLICATION, recording_id=name)
-    stream.spawn(default_blueprint=_blueprint(roots))
-    _log(stream, roots, drawings)
-    stream.flush()
+class RerunViewer:
+    """Rerun's viewer on the screen, which stays open. Otherwise as `write_rerun`."""
+
+    def __init__(self, name: str, roots: Sequence[str]) -> None:
+        self._roots, self._stream = roots, load_rerun().RecordingStream(APPLICATION, recording_id=name)
+        self._stream.spawn(default_blueprint=_blueprint(roots))
+
+    def draw(self, drawings: Iterable[Drawing]) -> None:
+        """Draw in order of time."""
+        _log(self._stream, self._roots, drawings)
+        self._stream.flush()
 
 
 def _blueprint(roots: Sequence[str]) -> Any:

@@ -190,7 +190,7 @@ class Odometry(Settings):
             return first
         errors = NewVariable(EGO_ERROR, 0, np.zeros(ERROR_DIM))
         prior = prior_factor(view.key(EGO_ERROR, 0), errors.state, np.diag(np.square(self.errors.slow)))
-        return Additions([*first.variables, errors], [*first.factors, prior])
+        return Additions([*first.variables, errors], [*list(first.factors), prior])  # type: ignore[arg-type]
 
     def _with_errors(
         self, view: GraphView, noise: OdometryNoise, a_T_b: FloatArray, covariance: FloatArray | None

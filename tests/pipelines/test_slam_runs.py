@@ -1,17 +1,20 @@
-"""Several drives in one map: places in common, the merged paths, and folders that cannot be merged."""
+"""Runs of SLAM: watched, as a page, and several in one map."""
 
+import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.scans import SENSOR_HEIGHT, SimulatedScans
+from benchmarks.scans import SENSOR_HEIGHT, SimulatedScans, write_recording
 from data_tools.trajectories import read_tum_poses
 from pipelines.slam.drive import read_map
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from pipelines.slam.merging import merge_sessions, read_session
 from pipelines.slam.results import write_lidar_slam
+from pipelines.view import Drawing, draw_slam_step
+from pipelines.view.scenes import Pose
 from saga_fg import InputError
 from saga_fg.numerics import inverse_transform, yaw_transform
 from saga_fg.slam.submaps import SubmapSettings
@@ -86,3 +89,45 @@ def test_folders_that_are_no_runs_are_one_line(runs: Path, tmp_path: Path, subte
             shown = refused("slam", "merge", *given, "--output", output)
             assert message in " ".join(shown.split())
             assert not output.exists()
+
+
+def test_a_page_shows_drift_errors_and_open_motions(runs: Path, tmp_path: Path) -> None:
+    shutil.copytree(runs / "there", tmp_path / "drive")
+    figures = json.loads((tmp_path / "drive" / "metrics.json").read_text())
+    figures["degenerate"] = [{"first": 4, "last": 9, "from": 0.4, "until": 0.9, "motions": ["along the road"]}]
+    (tmp_path / "drive" / "metrics.json").write_text(json.dumps(figures))
+    done("report", "slam", tmp_path / "drive", "--output", tmp_path / "drive.html")
+    page = (tmp_path / "drive.html").read_text()
+    assert page.count("data:image/png;base64,") == 2
+    assert "<td>4 to 9</td><td>0.5</td><td>along the road</td>" in page
+    assert f"<td>trajectory</td><td>{figures['trajectory']['ate']:.3f}</td>" in page
+    del figures["false_loops"]
+    (tmp_path / "drive" / "metrics.json").write_text(json.dumps(figures))
+    for folder, message in [
+        (tmp_path / "drive", "metrics.json: expected the figures of a run"),
+        (tmp_path, "expected"),
+    ]:
+        assert message in refused("report", "slam", folder, "--output", tmp_path / "none.html")
+    assert not (tmp_path / "none.html").exists()
+
+
+def test_a_run_is_drawn_while_it_goes_on() -> None:
+    scans, drawn = SimulatedScans(3, world_T_lidar=along(-10.0, 20.0, -1.5, 0.0)), list[Drawing]()
+    result = lidar_slam(scans, settings=PLAIN, watch=lambda *step: drawn.extend(draw_slam_step(*step)))
+    poses = [one for one in drawn if one.path == "slam/pose"]
+    assert [one.time for one in poses] == pytest.approx(scans.timestamps)
+    assert all(isinstance(one.shape, Pose) for one in poses)
+    np.testing.assert_allclose(poses[-1].shape.parent_T_child[:3, 3], result.online.positions[-1], atol=1e-9)
+    closed = {one.path for one in drawn if one.path.endswith("/points")}
+    assert closed == {f"slam/submap {number}/points" for number in range(len(result.submaps) - 1)}  # but the last
+    placed = [one for one in drawn if one.path == "slam/submap 0"]
+    np.testing.assert_allclose(placed[-1].shape.parent_T_child, result.world_T_submap[0], atol=0.05)
+
+
+def test_the_viewer_gets_each_scan_as_it_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rerun = pytest.importorskip("rerun")
+    saved = tmp_path / "live.rrd"
+    monkeypatch.setattr(rerun.RecordingStream, "spawn", lambda stream, **_: stream.save(str(saved)))
+    write_recording(SimulatedScans(3, world_T_lidar=along(-10.0, 0.0, -1.5, 0.0)), tmp_path / "scans")
+    done("slam", "scans", tmp_path / "scans", "--view", "--output", tmp_path / "out")
+    assert saved.stat().st_size > 10_000
