@@ -65,12 +65,8 @@ def read_corrections(path: Path) -> tuple[Correction, ...]:
 
 def corrections_of_lines(lines: Iterable[str], path: Path) -> tuple[Correction, ...]:
     """The corrections of a file's lines; raises as `read_corrections` does, but not where there are none."""
-    found = []
-    for number, line in enumerate(lines, 1):
-        if line.strip():
-            origin = f"{path}: line {number}"
-            found.append(correction_from(parsed_json(line, origin), origin))
-    return tuple(found)
+    numbered = [(f"{path}: line {number}", line) for number, line in enumerate(lines, 1) if line.strip()]
+    return tuple(correction_from(parsed_json(line, origin), origin) for origin, line in numbered)
 
 
 def correction_lines(path: Path) -> list[str]:
@@ -100,11 +96,11 @@ Outcomes = Sequence[tuple[str, Correction, str]]
 
 def write_outcomes(path: Path, outcomes: Outcomes) -> None:
     """Write what became of corrections, as a table."""
-    rows = (
-        [scene, one.origin, one.what, one.at.time, one.at.x, one.at.y, one.who, one.when, why]
-        for scene, one, why in outcomes
+    write_rows(
+        path,
+        COLUMNS,
+        ([scene, c.origin, c.what, c.at.time, c.at.x, c.at.y, c.who, c.when, why] for scene, c, why in outcomes),
     )
-    write_rows(path, COLUMNS, rows)
 
 
 def read_outcomes(folder: Path) -> list[tuple[str, str]]:
@@ -208,9 +204,9 @@ class Edits:
             new = [row for row in mine if self.pair[row] < 0]
             for row in new:
                 near = min(known or new[:1], key=lambda other: abs(self.theirs.frame[other] - self.theirs.frame[row]))
-                time = {"time": float(self.scene.timestamps[self.theirs.frame[row]])}
+                time = float(self.scene.timestamps[self.theirs.frame[row]])
                 size = dict(zip(SIZE, boxes.size[row].round(3).tolist(), strict=True))
-                box = {**time, **_place_of(boxes, row, height=True, yaw=True), **size}
+                box = {"time": time, **_place_of(boxes, row, height=True, yaw=True), **size}
                 about = self._place(self.ours, int(self.pair[near])) if known else self._place(self.theirs, near)
                 yield {"what": "box", "at": about, "label": str(boxes.label[row]), "box": box, "scene": self.scene.name}
 

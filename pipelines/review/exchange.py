@@ -29,6 +29,7 @@ from pipelines.scale_out import file_name
 from pipelines.smoothing import SmoothConfig
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import FloatArray, transform_points
+from saga_fg.smoothing.corrections import correction_from
 from saga_fg.types import Dataset, Scene
 
 
@@ -163,7 +164,9 @@ def import_edits(
             continue
         back = read_from_tool(path, tool, result.scene, fixed or labels, not fixed)
         compared = Edits(exchanged(result), *back)
-        found += compared.corrections()
+        checked = [(each, correction_from(each, str(path))) for each in compared.corrections()]
+        problems += [f"{one}: {one.too_far}: left out" for _, one in checked if one.too_far]
+        found += [record for record, one in checked if not one.too_far]
         unknown = sorted(set(back[0].boxes.label.tolist()) - labels) if not fixed else []
         problems += [f"{path}: class {name}: taken over, no label has had it before" for name in unknown]
         problems += [f"{path}: {line}" for line in compared.problems]

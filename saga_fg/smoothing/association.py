@@ -241,10 +241,8 @@ def assign_detections(
     """
     objects, detections = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=np.int64)]
     group, reported = evidence.confused.numbers(label, evidence.boxes.label[rows])
-    for number in np.unique(group):
+    for number in np.intersect1d(group, reported):
         a, b = np.flatnonzero(group == number), rows[reported == number]
-        if len(b) == 0:
-            continue
         z = evidence.boxes.position[b, :2]
         row, column = near_pairs(position[a], z, max_distance[a])
         innovation = z[column] - position[a][row]

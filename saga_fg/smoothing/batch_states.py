@@ -311,8 +311,7 @@ def robust_weights(evidence: Evidence, object_of: IntArray, states: StateTable, 
     rows = np.flatnonzero(at >= 0)
     residual = evidence.boxes.position[rows, :2] - states.mean[at[rows], :2]
     d2 = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(evidence.R[rows, :2, :2]), residual)
-    robust = np.maximum(loss.weight(np.sqrt(d2)), MIN_WEIGHT)
-    weight[rows] = np.where(evidence.corrected[rows] > 0, 1.0, robust)
+    weight[rows] = np.where(evidence.corrected[rows] > 0, 1.0, np.maximum(loss.weight(np.sqrt(d2)), MIN_WEIGHT))
     return weight
 
 

@@ -13,7 +13,10 @@ motion, each metre a vote,
     sum_k |v_k| dt cos(course_k - axis_k)
 
 where that comes to at least `TELLING_PATH`, else that of most detections, weighted by probability. A vehicle that backs
-out of a bay and drives away is right in the longer part.
+out of a bay and drives away is right in the longer part. Of vehicles that stand in a row most face one way: to
+the votes w_i of one are added those of the others in its lane or row whose axes are those of its own to `ALIGNED`,
+
+    clip( sum_j `SHARED` min(w_j, `MOST`) cos(yaw_j - axis_i), -1, 1 )
 
 Scalar random walks, one an object, smoothed together: heights and headings.
 
@@ -32,7 +35,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saga_fg.numerics import BoolArray, FloatArray, IntArray, wrap_angle
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, near_pairs, wrap_angle
 from saga_fg.smoothing.association import Evidence
 from saga_fg.smoothing.states import Lifespans, StateTable
 
@@ -114,6 +117,8 @@ TELLING_PATH = 10.0  # m
 CLEAR = 3.0  # standard deviations by which a motion is no estimation error
 CERTAIN = 1e6  # m, of a heading that a person gave
 COURSE_NOISE = 0.1  # standard deviation between heading and direction of motion, rad
+ROW_LENGTH, ROW_WIDTH, ALIGNED = 30.0, 2.0, 0.9  # m along and across, and cosine between the axes, of neighbours
+ELONGATED, SHARED, MOST = 1.5, 0.25, 3.0  # length by width of what stands in rows; share and most of its votes
 
 
 def constant_sizes(owner: IntArray, count: int, size: FloatArray, weight: FloatArray) -> FloatArray:
@@ -174,11 +179,12 @@ def smooth_headings(
     row: IntArray,
     growth: FloatArray,
     moving: FloatArray,
+    size: FloatArray,
 ) -> Headings:
     """Heading of every state.
 
     detection (m,) and row (m,): detections and the states they belong to; growth (R,): see `smooth_walks`; moving (n,):
-    speed from which the motion of an object tells its heading, m/s
+    speed from which the motion of an object tells its heading, m/s; size (n, 3): of the objects, m, NaN where unknown
     """
     owner = lifespans.rows_of(states.id)
     speed = np.hypot(*states.mean[:, 2:].T)
@@ -195,12 +201,34 @@ def smooth_headings(
     path = np.zeros(len(states))
     path[telling] = (speed * states.elapsed(evidence.times) * np.cos(course - np.nan_to_num(axis)))[telling]
     seen = evidence.probability[detection] * np.cos(np.where(known, yaw - axis[row], np.pi / 2))
-    votes = np.bincount(row, np.nan_to_num(seen), minlength=len(states))
+    votes = np.bincount(row, np.nan_to_num(seen), minlength=len(states)).astype(np.float64)
     told = np.flatnonzero(known & (evidence.corrected[detection] > 0))
     np.add.at(path, row[told], CERTAIN * np.cos(yaw[told] - axis[row[told]]))
+    in_row = size[:, 0] >= ELONGATED * size[:, 1]
+    votes += row_votes(states.mean[:, :2], axis, path, votes, owner, in_row)[owner] / np.bincount(owner)[owner]
     reversed_ = is_reversed(*(np.bincount(owner, w, len(lifespans)).astype(np.float64) for w in (path, votes)))
     sign = np.where(reversed_, -1.0, 1.0)[owner]
     return Headings(wrap_angle(axis + np.pi * (sign < 0)), variance, sign * path, sign * votes)
+
+
+def row_votes(
+    place: FloatArray, axis: FloatArray, path: FloatArray, votes: FloatArray, owner: IntArray, in_row: BoolArray
+) -> FloatArray:
+    """(n,) votes of the others in its row for the axis of each object, 0 where one moves.
+
+    place (R, 2), axis (R,), path (R,) and votes (R,) of the states of owners (R,); in_row (n,): which may stand in rows
+    """
+    n, first = len(in_row), np.unique(owner, return_index=True)[1]
+    x, y, path, votes = (np.bincount(owner, w, n).astype(np.float64) for w in (*place.T, path, votes))
+    standing = np.flatnonzero(in_row & (np.abs(path) < TELLING_PATH) & np.isfinite(axis[first]))
+    place = np.stack([x, y], axis=-1) / np.bincount(owner, minlength=n)[:, None]
+    place, yaw, votes = place[standing], axis[first][standing], votes[standing]
+    a, b = near_pairs(place, place, np.full(len(place), ROW_LENGTH))
+    across = np.abs(((place[b] - place[a]) * np.stack([-np.sin(yaw[a]), np.cos(yaw[a])], axis=-1)).sum(axis=1))
+    alike = np.cos(yaw[b] - yaw[a])
+    mine = (a != b) & (across < ROW_WIDTH) & (np.abs(alike) > ALIGNED)
+    given = SHARED * alike * np.clip(votes[b], -MOST, MOST) * mine
+    return np.asarray(np.clip(np.bincount(standing[a], given, n), -1.0, 1.0))
 
 
 def is_reversed(path: FloatArray, votes: FloatArray) -> BoolArray:

@@ -12,7 +12,7 @@ import numpy as np
 
 from saga_fg.graph import FactorProvider
 from saga_fg.model import FieldOfView, Sensor
-from saga_fg.numerics import BoolArray, FloatArray, IntArray, near_pairs
+from saga_fg.numerics import BoolArray, IntArray, near_pairs
 from saga_fg.smoothing.association import Evidence, EvidenceFrame, assign_free_detections, evidence_scores
 from saga_fg.smoothing.batch_states import StationaryStates, stationary_states
 from saga_fg.smoothing.corrections import Correction, Place, WholeObject
@@ -83,6 +83,9 @@ class _Edits:
 
     def take(self, number: int, one: Correction, now: SmoothedObjects) -> bool:
         """Take a correction of objects as smoothed now; False where there are none such yet."""
+        if problem := one.too_far:
+            self.outcome[number] = problem
+            return True
         moment, id_ = self._moment(one.time), self._object_at(one.at, now)
         if id_ < 0 and moment >= 0 and (one.what != "exists" or one.value):
             id_ = self._revived(number, one)
@@ -266,12 +269,13 @@ class _Edits:
         )
         final = final.select(np.isin(final.id, changed))
         rest = old.lifespans.select(others)
+        states, judged = (each.select(np.isin(each.id, rest.id)) for each in (old.states, old.judged))
         return evidence, SmoothedObjects(
             lifespans=_in_order(rest.append(lifespans)),
             object_of=object_of,
             track_of=track_of,
-            states=_of(old.states, rest).merged(final),
-            judged=_of(old.judged, rest).merged(within),
+            states=states.merged(final),
+            judged=judged.merged(within),
             stationary=stationary,
             dropped=old.dropped.select(~np.isin(old.dropped.id, changed)),
             held=held,
@@ -308,8 +312,11 @@ class _Edits:
         late = np.array([one.time for one in given]) - evidence.times[moment]
         place = values[:, :2] - evidence.origin - velocity * late[:, None]
         spread = deviation[:, 0] ** 2 + (SPEED_DOUBT * np.hypot(*velocity.T) * late) ** 2
-        label = [one.label or self._label(id_) for one, id_ in zip(given, owner.tolist(), strict=True)]
-        unknown, height = np.isnan(values[:, 2]), self._heights(owner)
+        unknown, detected = np.isnan(values[:, 2]), evidence.boxes
+        own = [np.flatnonzero(self._object_of == id_) for id_ in owner.tolist()]
+        height = np.array([detected.position[rows, 2].mean() if len(rows) else 0.0 for rows in own])
+        found = [str(detected.label[rows[0]]) if len(rows) else "object" for rows in own]
+        label = [one.label or usual for one, usual in zip(given, found, strict=True)]
         boxes = Boxes(
             np.array(label, dtype="U64"),
             np.column_stack([place, np.where(unknown, height, values[:, 2])]),
@@ -342,16 +349,6 @@ class _Edits:
         ordered = tuple(frames[k] for k in by_time.tolist())
         return replace(evidence, frames=ordered, frame=frame[order], boxes=boxes, **columns), order, owner
 
-    def _label(self, id_: int) -> str:
-        """The class of an object."""
-        rows = np.flatnonzero(self._object_of == id_)
-        return str(self._evidence.boxes.label[rows[0]]) if len(rows) else "object"
-
-    def _heights(self, owner: IntArray) -> FloatArray:
-        """(M,) mean heights of the objects' detections, m; 0 for those without."""
-        z, of = self._evidence.boxes.position[:, 2], self._object_of
-        return np.array([z[of == id_].mean() if (of == id_).any() else 0.0 for id_ in owner.tolist()])
-
 
 def _around(states: StateTable, mine: StateTable, others: BoolArray, lifespans: Lifespans) -> BoolArray:
     """(n,) which of the `others` (n,) come near the states of objects that are solved again."""
@@ -366,11 +363,6 @@ def _around(states: StateTable, mine: StateTable, others: BoolArray, lifespans: 
 
 def _in_order(lifespans: Lifespans) -> Lifespans:
     return lifespans.select(np.argsort(lifespans.id))
-
-
-def _of(states: StateTable, lifespans: Lifespans) -> StateTable:
-    """The states of some objects."""
-    return states.select(np.isin(states.id, lifespans.id))
 
 
 def _together(*parts: StationaryStates) -> StationaryStates:

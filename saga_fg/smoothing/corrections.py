@@ -30,6 +30,7 @@ from saga_fg.types import LATEST, MAX_POSITION, MAX_SIZE
 What = Literal["exists", "class", "same", "box", "standing", "size"]
 SIZE = ("length", "width", "height")
 LEAST = 1e-4  # m and rad, of sizes and deviations
+FARTHEST, FASTEST = 20.0, 60.0  # m from an object to its box, and m/s in the time between them
 DEVIATIONS = {"position": 0.1, "height": 0.1, "yaw": 0.05, "size": 0.05}
 """Standard deviations of a person's box where it gives none: m, m, rad, m."""
 
@@ -109,6 +110,13 @@ class Correction:
         """When the box is, s."""
         return self.box.get("time", self.at.time)
 
+    @property
+    def too_far(self) -> str:
+        """Why a box is not believed to be of its object, "" where it may be."""
+        moved = float(np.hypot(self.box.get("x", self.at.x) - self.at.x, self.box.get("y", self.at.y) - self.at.y))
+        limit = FARTHEST + FASTEST * abs(self.time - self.at.time)
+        return f"the box is {moved:.1f} m from its object, expected at most {limit:g} m" if moved > limit else ""
+
     def __str__(self) -> str:
         return f"{self.origin}: {self.what}, {self.at}"
 
@@ -137,11 +145,10 @@ def correction_from(record: Any, origin: str = "correction") -> Correction:
     texts: dict[str, Any] = {
         name: _text(record, name, origin) for name in ("who", "when", "scene", "label") if name in record
     }
-    at, found = _place(record, "at", origin), Correction(what, Place(0, 0, 0), origin=origin, **texts)
-    value = record.get("value", True)
+    at, value = _place(record, "at", origin), record.get("value", True)
     if not isinstance(value, bool):
         raise InputError(f"{origin}: value: expected true or false, got {value!r}")
-    found = replace(found, at=at, value=value)
+    found = Correction(what, at, value=value, origin=origin, **texts)
     if what == "class" and not found.label:
         raise InputError(f"{origin}: label: expected the class")
     if what == "same":
@@ -168,8 +175,10 @@ def corrections_in(scene: str, corrections: Iterable[Correction]) -> tuple[Corre
 
 def checked_corrections(corrections: Iterable[Correction | Mapping[str, Any]]) -> tuple[Correction, ...]:
     """Corrections, of which some may be records as in a file."""
-    numbered = enumerate(corrections, 1)
-    return tuple(c if isinstance(c, Correction) else correction_from(c, f"corrections: {n}") for n, c in numbered)
+    return tuple(
+        one if isinstance(one, Correction) else correction_from(one, f"corrections: {number}")
+        for number, one in enumerate(corrections, 1)
+    )
 
 
 def unfit(corrections: Iterable[Correction], outcomes: Iterable[tuple[str, str]]) -> list[str]:
@@ -198,8 +207,8 @@ def _number(record: Mapping[str, Any], name: str, origin: str, largest: float, p
     value = record.get(name)
     usable = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= largest
     if not usable or (positive and not value >= LEAST):  # type: ignore[operator]
-        kind = f"a number from {LEAST:g} on" if positive else "a number"
-        raise InputError(f"{origin}: {name}: expected {kind}, of at most {largest:g}, got {value!r:.40}")
+        least = f" from {LEAST:g} on" if positive else ""
+        raise InputError(f"{origin}: {name}: expected a number{least}, of at most {largest:g}, got {value!r:.40}")
     return float(value)  # type: ignore[arg-type]
 
 

@@ -80,9 +80,7 @@ def step_doubt(
     features = np.maximum(gap, 1e-2), np.clip(nearest[at], 0.3, REACH), np.clip(jump, 0.1, REACH)
     wrong = _probability(LINK, *map(np.log, features))
     told = (evidence.corrected[later] > 0) | (evidence.corrected[before] > 0)
-    log_right = np.zeros(len(states))
-    np.add.at(log_right, at, np.where(told, 0.0, np.log1p(-wrong)))
-    return log_right, rival
+    return np.bincount(at, np.where(told, 0.0, np.log1p(-wrong)), len(states)).astype(np.float64), rival
 
 
 def _companions(

@@ -63,8 +63,8 @@ class LabelColumns(Columns):
     def labels(self, time: float, size: FloatArray, score: FloatArray, probability: Probabilities) -> Labels:
         """All rows as the labels of one moment, at `time` s; of their objects size (R, 3), m, score (R,) and doubt."""
         boxes = Boxes(self.label, self.position, size, self.yaw, self.velocity)
-        P, P_velocity = self.position_covariance, self.velocity_covariance
-        tracks = Tracks(time, self.id, boxes, score, P, P_velocity, self.coasting)
+        P = self.position_covariance
+        tracks = Tracks(time, self.id, boxes, score, P, self.velocity_covariance, self.coasting)
         return Labels(tracks, self.yaw_variance, self.source, quality_of(score, P), probability)
 
 
@@ -98,7 +98,9 @@ def label_states(
     (lasting,) = class_values(settings.classes, OfflineClass, label, "position_bias")
     turning = np.where(_is_stationary(objects), 1e-6, YAW_DRIFT**2 * duration)
     (moving,) = class_values(settings.classes, OfflineClass, lifespans.label, "min_heading_speed")
-    headings = smooth_headings(states, lifespans, evidence, rows, at, turning, moving)
+    mine, weight = lifespans.rows_of(objects.object_of[rows]), size_weights(evidence)[rows]
+    size = constant_sizes(mine, len(lifespans), evidence.boxes.size[rows], weight)
+    headings = smooth_headings(states, lifespans, evidence, rows, at, turning, moving, size)
     P = states.covariance[:, :2, :2] + lasting[:, None, None] ** 2 * np.eye(2)
     gap = _time_to_detection(states, evidence.times, objects.object_of[rows], evidence.times[evidence.moment[rows]])
     columns = LabelColumns(
@@ -113,10 +115,9 @@ def label_states(
         coasting=gap,
         source=_sources(evidence, objects, wanted),
     )
-    mine, weight = lifespans.rows_of(objects.object_of[rows]), size_weights(evidence)[rows]
-    size = constant_sizes(mine, len(lifespans), evidence.boxes.size[rows], weight)
-    doubt = step_doubt(evidence, objects.object_of, lifespans, states, size[:, 0])
-    return LabelledStates(states, headings, columns, *doubt)
+    return LabelledStates(
+        states, headings, columns, *step_doubt(evidence, objects.object_of, lifespans, states, size[:, 0])
+    )
 
 
 def dropped_boxes(evidence: Evidence, objects: SmoothedObjects, wanted: FloatArray) -> int:

@@ -172,8 +172,7 @@ class Passes:
     ) -> ObjectMotion:
         """How objects move, whose first velocities are those of new tracks."""
         (speed,) = class_values(self.tracker.classes, ClassSettings, lifespans.label, "initial_speed_deviation")
-        prior = np.asarray(speed[:, None, None] ** 2 * np.eye(2))
-        return ObjectMotion(prior, self.settings.classes, edges, stationary)
+        return ObjectMotion(speed[:, None, None] ** 2 * np.eye(2), self.settings.classes, edges, stationary)
 
     def alone(self, lifespans: Lifespans, object_of: IntArray, ahead: float) -> StateTable:
         """States without edges of objects that reach beyond their detections, by `ahead` s at their ends."""
@@ -185,8 +184,8 @@ class Passes:
         if not self.tracker.edges:
             return states
         longer = lifespans.reaching(self.evidence.times, EXTENSION, ahead)
-        edges = self._edges(longer, object_of, states)
-        return smooth_states(self.evidence, object_of, longer, self.motion(longer, edges))
+        motion = self.motion(longer, self._edges(longer, object_of, states))
+        return smooth_states(self.evidence, object_of, longer, motion)
 
     def reaching_back(self, lifespans: Lifespans, object_of: IntArray, score: FloatArray) -> Lifespans:
         """Extend objects of a score (n,) above low quality to before their first detection, if that is far away."""
@@ -206,15 +205,13 @@ class Passes:
             edges = self._edges(lifespans, object_of, states.within(lifespans)) if self.tracker.edges else no_edges
             loss = self.settings.robust
             weight = None if loss is None else robust_weights(self.evidence, object_of, states, loss)
-            named = (new_part("providers", given, FactorProvider) for given in self.settings.providers)
-            asked = self.providers or list(named)
+            asked = self.providers or [new_part("providers", one, FactorProvider) for one in self.settings.providers]
             motion = self.motion(lifespans, edges, stationary)
             states = smooth_states(self.evidence, object_of, lifespans, motion, weight, asked)
         return states
 
     def _edges(self, lifespans: Lifespans, object_of: IntArray, states: StateTable) -> SmoothedEdges:
-        rows = np.flatnonzero(object_of >= 0)
-        rows = rows[np.isin(object_of[rows], lifespans.id)]
+        rows = np.flatnonzero(np.isin(object_of, lifespans.id))
         owner, boxes = lifespans.rows_of(object_of[rows]), self.evidence.boxes
         size = constant_sizes(owner, len(lifespans), boxes.size[rows], size_weights(self.evidence)[rows])
         yaw = np.full(len(lifespans), np.nan)

@@ -128,13 +128,10 @@ class Backlog:
 
     def _end(self, begin: float) -> float:
         """End of a chunk: after its length, or once it has enough detections."""
-        settings, count = self._settings, 0
-        for tracked in self._frames:
-            if tracked.time >= begin:
-                count += len(tracked.track_of)
-                if count >= settings.detections:
-                    return min(max(tracked.time, begin + MIN_LENGTH), begin + settings.length)
-        return begin + settings.length
+        mine = [tracked for tracked in self._frames if tracked.time >= begin]
+        count, longest = np.cumsum([len(tracked.track_of) for tracked in mine]), begin + self._settings.length
+        enough = np.flatnonzero(count >= self._settings.detections)
+        return min(max(mine[enough[0]].time, begin + MIN_LENGTH), longest) if len(enough) else longest
 
     def _oldest(self, otherwise: float) -> float:
         """Time of the first frame or moment that is left, s."""
@@ -340,9 +337,8 @@ class LabelBuilder:
             if id_ in names:
                 self._summaries[names[id_]].opportunities += looked
         times = evidence.times[[frame.moment for frame in frames]].tolist()
-        sums = self._sums
-        sums.frames += len(frames)
-        sums.first, sums.last = min([sums.first, *times]), max([sums.last, *times])
+        self._sums.frames += len(frames)
+        self._sums.first, self._sums.last = min([self._sums.first, *times]), max([self._sums.last, *times])
 
     def _write(self, chunk: _Chunk, names: Mapping[int, int], wanted: FloatArray) -> None:
         """Add the labels of the moments `wanted`, s, and add their headings to the summaries."""
@@ -366,10 +362,8 @@ class LabelBuilder:
                 self._summaries[names[id_]].boxes += len(rows)
                 self._summaries[names[id_]].rivals += int(labelled.rival[rows].sum())
             self._labels.add(wanted, at, labelled, names, signs)
-        new = LabelCounts(
-            dropped=dropped_boxes(evidence, objects, wanted),
-            dropped_objects=int(chunk.inside[objects.dropped.first].sum()),
-        )
+        gone = int(chunk.inside[objects.dropped.first].sum())
+        new = LabelCounts(dropped=dropped_boxes(evidence, objects, wanted), dropped_objects=gone)
         self._sums.counts = LabelCounts.sum([self._sums.counts, new])
 
     def _heading_sign(self, labelled: LabelledStates, name: int, id_: int, before: int) -> float:

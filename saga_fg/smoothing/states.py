@@ -275,13 +275,12 @@ class SmoothedEdges:
         at = self.states.rows_of(np.full(len(ids), moment), ids)
         rows, objects = np.flatnonzero(at >= 0), self.lifespans.rows_of(ids)
         mean, P = self.states.mean[at[rows]], self.states.covariance[at[rows]]
-        label: StrArray = self.lifespans.label[objects[rows]]
         velocity = mean[:, 2:]
         course = np.arctan2(velocity[:, 1], velocity[:, 0])
         known = np.isfinite(self.yaw[objects[rows]]) & (np.hypot(*velocity.T) < FACING)
         nodes = NodeTable(
             id=ids[rows],
-            label=label,
+            label=self.lifespans.label[objects[rows]],
             types=tuple(types[row] for row in rows.tolist()),
             position=mean[:, :2],
             velocity=velocity,

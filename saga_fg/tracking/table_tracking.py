@@ -105,8 +105,9 @@ def dense_traffic_settings() -> TrackerSettings:
     )
 
 
-UNKNOWN_SENSORS: Mapping[str, Sensor] = {DEFAULT: Sensor(calibrate_noise=True)}
-"""Models of sensors of which nothing is known: their detections tell how noisy they are."""
+UNKNOWN_SENSORS: Mapping[str, Sensor] = {DEFAULT: Sensor(calibrate_noise=True, clutter_area=5000.0)}
+"""Models of sensors of which nothing is known: their detections tell how noisy they are, and their scores how many of a
+frame are false."""
 
 UNNAMED = "object"
 """Class of detections without a column of classes; any name will do."""

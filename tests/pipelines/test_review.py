@@ -515,6 +515,22 @@ def test_labels_go_out_to_a_tool_and_edits_come_back(made, labels, tmp_path, too
     assert rows.source[moved] == "corrected"
 
 
+def test_a_box_that_a_tool_moved_out_of_sight_is_named_and_the_others_count(made, labels, tmp_path):
+    def moved(found: SceneBoxes) -> SceneBoxes:
+        passing = (found.boxes.position[:, 1] < -4) & np.isin(found.frame, [3, 9])
+        by = np.where(found.frame == 3, 500.0, 0.8) * passing
+        return replace(found, boxes=replace(found.boxes, position=found.boxes.position - by[:, None] * [0, 1, 0]))
+
+    done("review", labels, "--export", "openlabel", tmp_path / "out")
+    with read_label_run(labels).open() as (_, dataset):
+        edit_in_tool(tmp_path / "out", "openlabel", dataset.scene("a"), moved)
+    told = done("review", labels, "--import", "openlabel", tmp_path / "out")
+    assert "1 new correction: 1 box" in told.output
+    (line,) = [line for line in told.stderr.splitlines() if "m from its object" in line]
+    assert f"{tmp_path / 'out' / 'a.json'}: box, car at " in line
+    assert "the box is 500.0 m from its object, expected at most 20 m: left out" in line
+
+
 def test_what_is_wrong_with_a_tool_or_its_files_is_one_line(labels, tmp_path):
     out = tmp_path / "out"
     assert "unknown labelling tool 'cavt'; did you mean 'cvat'?" in refused("review", labels, "--export", "cavt", out)

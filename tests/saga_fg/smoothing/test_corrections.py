@@ -111,6 +111,18 @@ def test_one_object_is_cut_and_two_become_one(builder):
     assert boxes_of(joined, 3).keys() == boxes_of(cut, 3).keys() | boxes_of(cut, 10**7).keys()
 
 
+def test_a_box_far_from_its_object_is_left_out_and_named(builder):
+    plain, _ = corrected(builder)
+    far, later = {"x": 540.0, "y": 0.0}, {"x": 64.0, "y": 0.0, "time": 8.0}  # the car drives at 8 m/s
+    found, problems = corrected(
+        builder, {"what": "box", "at": CAR, "box": far}, {"what": "box", "at": CAR, "box": later}
+    )
+    assert problems == ["the box is 500.0 m from its object, expected at most 20 m"]
+    before, after = boxes_of(plain, 1), boxes_of(found, 1)
+    assert before.keys() == after.keys()
+    assert all(np.hypot(*(after[time] - before[time])[:2]) < 1.0 for time in before)
+
+
 def test_what_is_seen_at_two_places_at_once_is_not_one_object(builder):
     plain, _ = corrected(builder)
     cars = {"time": 5.0, "x": 10.0, "y": 0.0}

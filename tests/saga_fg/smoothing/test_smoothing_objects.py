@@ -32,6 +32,7 @@ from saga_fg.smoothing import (
     stationary_states,
     stitch_tracklets,
 )
+from saga_fg.smoothing.boxes import row_votes
 from saga_fg.tracking import ClassSettings
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
@@ -129,11 +130,27 @@ def test_the_front_is_where_an_object_drives_else_what_most_detections_say():
     states = smooth_states(evidence, numbers, lifespans, ObjectMotion(np.tile(25.0 * np.eye(2), (2, 1, 1)), CLASSES))
     rows = np.arange(len(evidence))
     at = states.rows_of(evidence.moment, numbers)
-    found = smooth_headings(states, lifespans, evidence, rows, at, np.full(len(states), 0.01), np.full(2, 2.0))
+    size = np.tile([4.5, 1.8, 1.5], (2, 1))
+    found = smooth_headings(states, lifespans, evidence, rows, at, np.full(len(states), 0.01), np.full(2, 2.0), size)
     yaw, variance = found.yaw, found.variance
     assert np.allclose(np.cos(yaw[states.id == 0]), -1.0, atol=0.01)  # the detector says 0, the motion pi
     assert np.allclose(yaw[states.id == 1], 0.0, atol=1e-6)
     assert (variance > 0).all()
+
+
+def test_who_stands_in_a_row_faces_as_the_others_there_do():
+    place = np.array([[0.0, 0.0], [6.0, 0.5], [12.0, -0.5], [6.0, 8.0], [18.0, 0.0], [24.0, 0.0]])
+    axis, path = np.array([0.1, 0.0, np.pi, 0.0, np.pi / 2, 0.0]), np.array([0.0, 0.0, 0.0, 0.0, 0.0, 50.0])
+    votes, rows = np.array([-0.2, 8.0, -2.0, -9.0, -9.0, -9.0]), np.arange(6)
+    found = row_votes(place, axis, path, votes, rows, np.ones(6, dtype=bool))
+    assert (
+        found[0] > 0.9
+    )  # two of the others face along its axis; the next row, who stands across and who moves do not tell
+    assert found[2] < -0.6
+    assert (found[3:] == 0).all()
+    assert (np.abs(found) <= 1).all()
+    alone = row_votes(place, axis, path, votes, rows, rows == 0)
+    assert (alone == 0).all()
 
 
 def test_edges_follow_from_smoothed_states_and_strangers_move_on_their_own():
