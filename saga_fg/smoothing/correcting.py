@@ -315,8 +315,10 @@ class _Edits:
         unknown, detected = np.isnan(values[:, 2]), evidence.boxes
         own = [np.flatnonzero(self._object_of == id_) for id_ in owner.tolist()]
         height = np.array([detected.position[rows, 2].mean() if len(rows) else 0.0 for rows in own])
-        found = [str(detected.label[rows[0]]) if len(rows) else "object" for rows in own]
-        label = [one.label or usual for one, usual in zip(given, found, strict=True)]
+        label = [
+            one.label or (str(detected.label[rows[0]]) if len(rows) else "object")
+            for one, rows in zip(given, own, strict=True)
+        ]
         boxes = Boxes(
             np.array(label, dtype="U64"),
             np.column_stack([place, np.where(unknown, height, values[:, 2])]),

@@ -207,8 +207,8 @@ def _number(record: Mapping[str, Any], name: str, origin: str, largest: float, p
     value = record.get(name)
     usable = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= largest
     if not usable or (positive and not value >= LEAST):  # type: ignore[operator]
-        least = f" from {LEAST:g} on" if positive else ""
-        raise InputError(f"{origin}: {name}: expected a number{least}, of at most {largest:g}, got {value!r:.40}")
+        expected = f"a number from {LEAST:g} on" if positive else "a number"
+        raise InputError(f"{origin}: {name}: expected {expected}, of at most {largest:g}, got {value!r:.40}")
     return float(value)  # type: ignore[arg-type]
 
 

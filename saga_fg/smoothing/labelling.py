@@ -63,9 +63,9 @@ class LabelColumns(Columns):
     def labels(self, time: float, size: FloatArray, score: FloatArray, probability: Probabilities) -> Labels:
         """All rows as the labels of one moment, at `time` s; of their objects size (R, 3), m, score (R,) and doubt."""
         boxes = Boxes(self.label, self.position, size, self.yaw, self.velocity)
-        P = self.position_covariance
-        tracks = Tracks(time, self.id, boxes, score, P, self.velocity_covariance, self.coasting)
-        return Labels(tracks, self.yaw_variance, self.source, quality_of(score, P), probability)
+        tracks = Tracks(time, self.id, boxes, score, self.position_covariance, self.velocity_covariance, self.coasting)
+        quality = quality_of(score, tracks.position_covariance)
+        return Labels(tracks, self.yaw_variance, self.source, quality, probability)
 
 
 @dataclass(frozen=True, eq=False)

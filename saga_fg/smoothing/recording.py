@@ -362,8 +362,10 @@ class LabelBuilder:
                 self._summaries[names[id_]].boxes += len(rows)
                 self._summaries[names[id_]].rivals += int(labelled.rival[rows].sum())
             self._labels.add(wanted, at, labelled, names, signs)
-        gone = int(chunk.inside[objects.dropped.first].sum())
-        new = LabelCounts(dropped=dropped_boxes(evidence, objects, wanted), dropped_objects=gone)
+        new = LabelCounts(
+            dropped=dropped_boxes(evidence, objects, wanted),
+            dropped_objects=int(chunk.inside[objects.dropped.first].sum()),
+        )
         self._sums.counts = LabelCounts.sum([self._sums.counts, new])
 
     def _heading_sign(self, labelled: LabelledStates, name: int, id_: int, before: int) -> float:
