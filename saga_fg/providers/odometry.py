@@ -175,10 +175,13 @@ class Odometry(Settings):
         if self.errors is not None:
             return self._with_errors(view, self.errors, motion.matrix(), covariance)
         assert covariance is not None
-        new = (
-            [] if view.now(EGO_POSE) else [NewVariable(EGO_POSE, 0, view.state(last).compose(motion), label="vehicle")]
-        )
+        new = self._new_pose(view, view.state(last).compose(motion))
         return Additions(new, [between_factor(last, key, motion.matrix(), covariance)])
+
+    @staticmethod
+    def _new_pose(view: GraphView, state: Pose) -> list[NewVariable]:
+        """The pose, unless another provider has added it."""
+        return [] if view.now(EGO_POSE) else [NewVariable(EGO_POSE, 0, state, label="vehicle")]
 
     def factors(self, view: GraphView) -> Additions:
         return Additions()
@@ -186,7 +189,7 @@ class Odometry(Settings):
     def _begun(self, view: GraphView) -> Additions:
         """The first pose, with the errors where they are estimated."""
         first = self.start.additions(view)
-        if self.errors is None or not first.variables:
+        if self.errors is None:
             return first
         errors = NewVariable(EGO_ERROR, 0, np.zeros(ERROR_DIM))
         prior = prior_factor(view.key(EGO_ERROR, 0), errors.state, np.diag(np.square(self.errors.slow)))
@@ -198,7 +201,7 @@ class Odometry(Settings):
         last, slow = view.before(EGO_POSE)[0].key, view.before(EGO_ERROR)[0].key
         errors, dt = np.asarray(view.state(slow)), np.array([view.dt])
         pose = view.state(last).compose(gtsam.Pose3(without_errors(a_T_b, errors, view.dt)))
-        new = [NewVariable(EGO_POSE, 0, pose, label="vehicle"), NewVariable(EGO_ERROR, 0, errors)]
+        new = [*self._new_pose(view, pose), NewVariable(EGO_ERROR, 0, errors)]
         rows = np.array([[last, view.key(EGO_POSE, 0), slow, view.key(EGO_ERROR, 0)]], dtype=np.uint64)
         P = noise.of_increments(a_T_b[None], dt, [covariance])
         return Additions(new, [odometry_factors(rows, a_T_b[None], dt, P)])
