@@ -85,6 +85,9 @@ def read_session(folder: str | Path) -> Session:
     """Read the output folder of `saga-fg slam scans`. Raises `InputError` naming the file of what is missing or broken,
     and for a drive of one keyframe."""
     folder = Path(folder)
+    for name in ("graph.g2o", "covariances.csv", "trajectory.tum"):
+        if not (folder / name).is_file():
+            raise InputError(f"{folder}: expected {name}, as `saga-fg slam scans` writes it")
     slam_map, graph = read_map(folder), read_g2o(folder / "graph.g2o")
     columns = 22  # a time, and the upper triangle of a covariance
     table = read_table(folder / "covariances.csv", (columns,), "timestamp,P11,...", ",")
