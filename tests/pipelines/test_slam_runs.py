@@ -81,7 +81,7 @@ def test_folders_that_are_no_runs_are_one_line(runs: Path, tmp_path: Path, subte
     for given, message in [
         ([there], "RUN: expected two folders or more of different names, got there"),
         ([there, there], "got there, there"),
-        ([there, tmp_path / "none"], "expected a map"),
+        ([there, tmp_path / "none"], "none: expected graph.g2o, as"),
         ([there, tmp_path / "cut"], "graph.g2o"),
         ([there, tmp_path / "short"], "expected as many rows of covariances.csv as poses of graph.g2o"),
     ]:
