@@ -91,8 +91,9 @@ def review(
     check_writable(page or file)
     with chdir(run.directory):
         if out is not None:
-            boxes, clouds = export_labels(folder, run, *out)
-            typer.echo(f"{out[1]}: {counted(boxes, 'box')}, {counted(clouds, 'point cloud')}")
+            boxes, clouds, without = export_labels(folder, run, *out)
+            unsized = f"; {counted(without, 'box')} without a size left out" if without else ""
+            typer.echo(f"{out[1]}: {counted(boxes, 'box')}, {counted(clouds, 'point cloud')}{unsized}")
             return
         if back is not None:
             kinds, problems = import_edits(folder, run, *back, file, who)

@@ -116,13 +116,14 @@ SCAN_TIME = 0.06  # s between a moment and its scan
 WHEN = ("who", "when")  # of a correction, which do not make it another
 
 
-def export_labels(folder: Path, run: LabelRun, tool: str, output: Path) -> tuple[int, int]:
-    """Write the labels of a folder for a tool, a file or folder for each scene; return the numbers of boxes and scans.
+def export_labels(folder: Path, run: LabelRun, tool: str, output: Path) -> tuple[int, int, int]:
+    """Write the labels of a folder for a tool, a file or folder for each scene; return the numbers of boxes and scans,
+    and of boxes that were left out, as their size is unknown.
 
     output: a new or empty folder, which appears when all is written. Raises `InputError` where the labels or the
     recordings can't be read, and for a folder that is not writable or holds anything: it may be somebody's edits.
     """
-    form, boxes, clouds = tool_format(tool), 0, 0
+    form, boxes, clouds, every = tool_format(tool), 0, 0, 0
     if output.is_dir() and any(output.iterdir()):
         raise InputError(f"{output}: expected a new or an empty folder, it may hold edits")
     with run.open() as (source, dataset), atomic_directory(output) as whole:
@@ -131,6 +132,7 @@ def export_labels(folder: Path, run: LabelRun, tool: str, output: Path) -> tuple
         for result in labelled_scenes(folder, scenes):
             name = file_name(result.scene.name)
             boxes += write_for_tool(whole / f"{name}{form.suffix}", tool, result)
+            every += len(result.found)
             for k, time in enumerate(result.scene.timestamps.tolist()):
                 points = ego_points(scans.get(result.scene.name), time)
                 if len(points):
@@ -138,7 +140,7 @@ def export_labels(folder: Path, run: LabelRun, tool: str, output: Path) -> tuple
                     cloud.parent.mkdir(exist_ok=True)
                     write_cloud(cloud, points)
                     clouds += 1
-    return boxes, clouds
+    return boxes, clouds, every - boxes
 
 
 def import_edits(

@@ -29,7 +29,7 @@ from saga_fg.types import LATEST, MAX_POSITION, MAX_SIZE
 
 What = Literal["exists", "class", "same", "box", "standing", "size"]
 SIZE = ("length", "width", "height")
-LEAST = 1e-4  # m and rad, of sizes and deviations
+LEAST, RADIANS = 1e-4, 2 * np.pi  # m and rad, of sizes and deviations; rad, beyond which headings are degrees
 FARTHEST, FASTEST = 20.0, 60.0  # m from an object to its box, and m/s in the time between them
 DEVIATIONS = {"position": 0.1, "height": 0.1, "yaw": 0.05, "size": 0.05}
 """Standard deviations of a person's box where it gives none: m, m, rad, m."""
@@ -102,8 +102,7 @@ class Correction:
     def whole(self) -> WholeObject:
         """The part of the correction that holds for the object at all times."""
         exists = self.value if self.what == "exists" else True if self.what == "box" else None
-        size = self.size if self.what == "size" else UNKNOWN_SIZE
-        return WholeObject(exists, self.label, size)
+        return WholeObject(exists, self.label, self.size if self.what == "size" else UNKNOWN_SIZE)
 
     @property
     def time(self) -> float:
@@ -220,8 +219,7 @@ def _place(record: Mapping[str, Any], name: str, origin: str) -> Place:
     if extra := [key for key in place if key not in ("time", "x", "y", "label")]:
         raise InputError(f"{where}: {extra[0]}: expected time, x, y and label only")
     x, y = (_number(place, axis, where, MAX_POSITION) for axis in ("x", "y"))
-    label = _text(place, "label", where) if "label" in place else ""
-    return Place(_number(place, "time", where, LATEST), x, y, label)
+    return Place(_number(place, "time", where, LATEST), x, y, _text(place, "label", where) if "label" in place else "")
 
 
 def _numbers(
@@ -230,5 +228,5 @@ def _numbers(
     values = record.get(name, {})
     if not isinstance(values, Mapping) or any(key not in known for key in values):
         raise InputError(f"{origin}: {name}: expected {', '.join(known)} only, got {values!r:.60}")
-    largest = {**dict.fromkeys(known, MAX_POSITION), "time": LATEST, **dict.fromkeys(SIZE, MAX_SIZE)}
+    largest = {**dict.fromkeys(known, MAX_POSITION), "time": LATEST, "yaw": RADIANS, **dict.fromkeys(SIZE, MAX_SIZE)}
     return {key: _number(values, key, f"{origin}: {name}", largest[key], key in positive) for key in values}

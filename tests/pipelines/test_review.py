@@ -531,6 +531,14 @@ def test_a_box_that_a_tool_moved_out_of_sight_is_named_and_the_others_count(made
     assert "the box is 500.0 m from its object, expected at most 20 m: left out" in line
 
 
+def test_boxes_of_unknown_size_do_not_go_out_and_are_counted(tmp_path):
+    rows = "".join(f"{k},car,{5 * k},0\n" for k in range(20))
+    (tmp_path / "seen.csv").write_text("timestamp,label,x,y\n" + rows)
+    done("smooth", "file", tmp_path / "seen.csv", "-o", tmp_path / "labels")
+    told = done("review", tmp_path / "labels", "--export", "openlabel", tmp_path / "out")
+    assert "0 boxes, 0 point clouds; 20 boxes without a size left out" in told.output
+
+
 def test_what_is_wrong_with_a_tool_or_its_files_is_one_line(labels, tmp_path):
     out = tmp_path / "out"
     assert "unknown labelling tool 'cavt'; did you mean 'cvat'?" in refused("review", labels, "--export", "cavt", out)

@@ -223,6 +223,7 @@ BROKEN = [
         {"what": "box", "at": PLACE, "box": {"x": 1, "y": 1}, "deviation": {"yaw": 0}},
         "deviation: yaw: expected a",
     ),
+    ({"what": "box", "at": PLACE, "box": {"x": 1, "y": 1, "yaw": 90}}, "box: yaw: expected a number, of at most 6.28"),
     ({"what": "size", "at": PLACE, "box": {"length": 1}}, "box: expected length, width, height"),
 ]
 
