@@ -255,11 +255,16 @@ def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | Non
     return headings_in_degrees(sample.yaw) if of_objects is None else None
 
 
+_STILL = 0.5  # m/s between frames, below which an object may stand
 _SPEEDS = {"km/h": 3.6, "ft/s": 3.281, "mph": 2.237}
 
 
 def speeds_against_motion(velocity: FloatArray, motion: FloatArray) -> Finding | None:
-    """Measured velocities (n, 2) which are those between frames (n, 2) in another unit than m/s, or are none."""
+    """Measured velocities (n, 2) which are those between frames (n, 2) in another unit than m/s, or are none.
+
+    Fast objects tell the factor. Where all are slow, the mean squares of all velocities v do, less the noise of those
+    that stay where they are: f = sum(|v|^2 - noise) / sum(v m), with m between frames.
+    """
     known = np.isfinite(motion).all(axis=1) & np.isfinite(velocity).all(axis=1)
     moves = known & (np.hypot(*motion.T) > _MOVES)
     if moves.sum() >= 2 * FEWEST and share(np.abs(velocity[moves]).max(axis=1) < 1e-9) > 0.9:
@@ -273,12 +278,18 @@ def speeds_against_motion(velocity: FloatArray, motion: FloatArray) -> Finding |
     ratio = (measured * moved).sum(axis=1) / weight
     order = np.argsort(ratio)
     middle = order[np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())]  # fast objects tell more
-    factor = float(1 / max(ratio[middle], 1e-3))
-    unit = min(_SPEEDS, key=lambda unit: abs(np.log(factor / _SPEEDS[unit])))
-    if not 0.85 < factor / _SPEEDS[unit] < 1.15:
-        return None
-    what = f"measured velocities are {factor:.2g} times as large as objects move from frame to frame"
-    return Finding("speeds", f"{what}: they look like {unit}", "expected m/s", Mend(units={"speed": unit}))
+    found = [(1 / max(ratio[middle], 1e-3), list(_SPEEDS))]
+    still, squares = known & (np.hypot(*motion.T) < _STILL), (velocity**2).sum(axis=1)
+    if still.sum() >= FEWEST:
+        noise = np.median(squares[still]) / np.log(2)
+        factor = (squares[known] - noise).sum() / max((velocity[known] * motion[known]).sum(), 1e-3)
+        found.append((max(factor, 1e-3), ["km/h", "mph"]))  # too rough for more
+    for factor, units in found:
+        unit = min(units, key=lambda unit: abs(np.log(factor / _SPEEDS[unit])))
+        if 0.85 < factor / _SPEEDS[unit] < 1.15:
+            what = f"measured velocities are {factor:.2g} times as large as objects move from frame to frame"
+            return Finding("speeds", f"{what}: they look like {unit}", "expected m/s", Mend(units={"speed": unit}))
+    return None
 
 
 def camera_axes(position: FloatArray) -> Finding | None:

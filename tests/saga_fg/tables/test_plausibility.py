@@ -117,6 +117,10 @@ def test_speeds_against_motion(subtests):
             finding = speeds_against_motion(measured, motion + RNG.normal(0, 0.5, motion.shape))
             assert option(finding) == (None if found is None else f"--units speed={found}")
     assert option(speeds_against_motion(0 * motion, motion)) == "--columns vx=,vy="
+    slow = np.concatenate([np.zeros((600, 2)), np.tile([1.3, 0.0], (200, 1))])  # who walks past parked cars
+    walked, measured = (slow + RNG.normal(0, 0.3, slow.shape) for _ in range(2))
+    assert option(speeds_against_motion(3.6 * measured, walked)) == "--units speed=km/h"
+    assert speeds_against_motion(measured, walked) is None
     assert speeds_against_motion(3.6 * motion[:20], motion[:20]) is None
     assert speeds_against_motion(3.6 * motion, np.full(motion.shape, np.nan)) is None
 
