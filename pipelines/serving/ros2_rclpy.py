@@ -7,6 +7,7 @@ Source: the manual of rclpy, https://docs.ros.org/en/jazzy/p/rclpy/.
 """
 
 import atexit
+import logging
 import time
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
@@ -27,12 +28,17 @@ except ImportError as error:
         "rclpy comes with ROS 2: source its setup.bash first, or --middleware cyclonedds"
     ) from error
 
+log = logging.getLogger(__name__)
+
 
 class RclpyNetwork(Ros2Network):
-    """A node of ROS 2."""
+    """A node of ROS 2; messages of packages that are not installed are left out, and told.
+
+    Raises `InputError` for a topic that could have no others.
+    """
 
     def __init__(self, wanted: Mapping[str, Collection[str]]) -> None:
-        super().__init__(wanted)
+        super().__init__({topic: _installed(topic, types) for topic, types in wanted.items()})
         self._context = Context()  # of its own, which leaves signals alone
         rclpy.init(context=self._context)
         atexit.register(self._context.try_shutdown)
@@ -74,6 +80,22 @@ class RclpyNetwork(Ros2Network):
 
     def _take(self, topic: str, data: bytes) -> None:
         self._came.append(LoggedMessage(self.subscribed[topic], 0, time.time_ns(), data))
+
+
+def _installed(topic: str, types: Collection[str]) -> list[str]:
+    """Those of the types of a topic whose packages are installed."""
+    found, lacking = [], {}
+    for type_ in types:
+        try:
+            _message_class(type_)
+            found.append(type_)
+        except InputError as error:
+            lacking[type_.partition("/")[0]] = error
+    if not found:
+        raise InputError(f"{topic}: needs {' or '.join(lacking)}, installed in ROS") from next(iter(lacking.values()))
+    for package in lacking:
+        log.warning("%s: %s is not installed in ROS, its messages cannot be read", topic, package)
+    return found
 
 
 def _message_class(type_: str) -> Any:

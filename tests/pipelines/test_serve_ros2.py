@@ -388,14 +388,19 @@ def test_the_node_runs_by_rclpy_where_that_is_installed(monkeypatch):
 
 def test_packages_that_ros_lacks_and_other_types_are_named(monkeypatch, caplog):
     ros = FakeRos(monkeypatch)
-    network = open_network({"/odom": ("nav_msgs/Odometry",), "/objects": (DETECTED,)}, "rclpy")
-    ros.offer("/objects", "std_msgs/msg/Header")
-    for _ in range(2):
-        assert network.received(0.0) == []
-    assert caplog.messages == [f"/objects: expected messages of {DETECTED}, std_msgs/Header is published: left out"]
-    ros.offer("/odom", "nav_msgs/msg/Odometry")
+    with pytest.raises(InputError, match=r"^/odom: needs nav_msgs, installed in ROS$"):
+        open_network({"/objects": (DETECTED,), "/odom": ("nav_msgs/Odometry",)}, "rclpy")
+    network = open_network({"/objects": (DETECTED, "nav_msgs/Odometry")}, "rclpy")
+    assert caplog.messages == ["/objects: nav_msgs is not installed in ROS, its messages cannot be read"]
+    caplog.clear()
+    for type_ in ("std_msgs/Header", "nav_msgs/Odometry"):
+        ros.offer("/objects", type_.replace("/", "/msg/"))
+        for _ in range(2):
+            assert network.received(0.0) == []
+        assert f"/objects: expected messages of {DETECTED}, {type_} is published: left out" in caplog.messages
+    assert len(caplog.messages) == 2
     with pytest.raises(InputError, match="nav_msgs/Odometry: expected its package to be installed in ROS"):
-        network.received(0.0)
+        network.publisher("/tracks", "nav_msgs/Odometry")
 
 
 def test_the_middleware_is_what_is_asked_for(monkeypatch):
