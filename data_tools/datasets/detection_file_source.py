@@ -115,7 +115,7 @@ class DetectionFileSource(DatasetSource):
     like: Literal["plain", "dense"] | None = option(
         f"{LIKE_TEXT}.  [default: what the first rows look like]",
         None,
-        verbs=("track",),
+        verbs=("track", "smooth", "evaluate", "evaluate labels"),
     )
     table_import: TableImport | None = option(IMPORT_TEXT, None, flag="--import", metavar="FILE")
     truth_import: TableImport | None = option(
@@ -216,9 +216,9 @@ class DetectionFileSource(DatasetSource):
     def _true_scenes(self) -> Iterator[Dataset]:
         """The scenes of --truth, with the frames of the detections where these are there."""
         assert self.truth is not None
-        how = self.how if self.truth_import is None else self.truth_import
+        own = self.truth_import
         with local_copy(self.truth) as path:
-            truth = read_truth(path, how)
+            truth = read_truth(path, self.how) if own is None else read_truth(path, own, "--truth-import")
         dataset: Dataset = truth
         if self.detections is not None:
             with local_copy(self._table()) as path:

@@ -1,7 +1,9 @@
 from .column_names import (
+    COMMAND,
     Clock,
     Columns,
     TableImport,
+    canonical,
     meaning,
     option_text,
     pairs,
@@ -33,6 +35,7 @@ from .plausibility import idle_lanes, idle_rules, seems_dense_traffic, settings_
 __all__ = [
     "BOX",
     "COLUMNS",
+    "COMMAND",
     "LABEL_COLUMNS",
     "NAME",
     "NAMED",
@@ -54,6 +57,7 @@ __all__ = [
     "Values",
     "as_names",
     "box_columns",
+    "canonical",
     "clock_of",
     "findings_of",
     "idle_lanes",

@@ -312,18 +312,28 @@ def understood(
 
 
 def option_text(entries: Mapping[str, Any], within: str = COMMAND) -> str:
-    """Entries of a `TableImport` as options of the command, or as arguments of a program.
+    """Entries of a `TableImport` as options of the command, as an argument of a program, or as lines of a file.
 
-    within: the argument that is a `TableImport`, "" where the entries are arguments themselves
+    within: the argument that is a `TableImport`, or the option that names such a file
     """
-    if within != COMMAND:
-        arguments = ", ".join(f"{name}={value!r}" for name, value in entries.items())
-        return f"{within}=TableImport({arguments})" if within else arguments
-    texts = {
-        name: value if isinstance(value, str) else ",".join(f"{a}={b}" for a, b in value.items())
-        for name, value in entries.items()
-    }
-    return " ".join(f"--{name} {shlex.quote(text)}" for name, text in texts.items() if text)
+    if within == COMMAND:
+        texts = {name: _of_option(value) for name, value in entries.items() if value}
+        return " ".join(f"--{name.replace('_', '-')} {text}".rstrip() for name, text in texts.items())
+    if within.startswith(COMMAND):
+        return f"{within} ({', '.join(f'{name}: {_of_yaml(value)}' for name, value in entries.items())})"
+    return f"{within}=TableImport({', '.join(f'{name}={value!r}' for name, value in entries.items())})"
+
+
+def _of_option(value: Any) -> str:
+    if value is True:
+        return ""
+    return shlex.quote(value if isinstance(value, str) else ",".join(f"{a}={b}" for a, b in value.items()))
+
+
+def _of_yaml(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{a}: {_of_yaml(b)}' for a, b in value.items())}}}"
+    return str(value).lower() if value is True else value or "''"
 
 
 def _plain(name: str) -> str:
@@ -428,21 +438,23 @@ class TableImport(Settings):
         """False where a suspicion stays although these options say all that mends it."""
         return any(getattr(self.mended(mend, {}), field.name) != getattr(self, field.name) for field in fields(Mend))
 
-    def judged(self, findings: Iterable[Finding], names: Mapping[str, str]) -> tuple[Finding, ...]:
-        """The findings, each with the options that mend it, and whether the table contradicts how it is read."""
+    def judged(
+        self, findings: Iterable[Finding], names: Mapping[str, str], within: str = COMMAND
+    ) -> tuple[Finding, ...]:
+        """The findings, each with the options that mend it, as of `option_for`, and whether the table contradicts how
+        it is read."""
         judged = [one if one.mend is None or self._mends(one.mend) else replace(one, mend=None) for one in findings]
         judged = [replace(one, stops=not self.as_given and one.contradicts) for one in judged]
         together = reduce(or_, (one.mend for one in judged if one.stops and one.mend is not None), Mend())
         mends = [together if one.stops else one.mend for one in judged]
-        options = ["" if mend is None else self.option_for(mend, names) for mend in mends]
+        options = ["" if mend is None else self.option_for(mend, names, within) for mend in mends]
         return tuple(
             replace(one, mend=mend, option=option) for one, mend, option in zip(judged, mends, options, strict=True)
         )
 
     def options(self) -> str:
         """The options of the command that say the same, with a space before each; empty if there are none."""
-        text = option_text({field.name: getattr(self, field.name) for field in fields(Mend)})
-        return f" {text}" * bool(text) + " --sort" * self.sort + " --as-given" * self.as_given
+        return f" {option_text(self.values())}".rstrip()
 
     def values(self) -> dict[str, Any]:
         """The values that differ from the default, for a record."""

@@ -88,7 +88,7 @@ class DetectionTable:
         if "coordinates" in raw.columns:  # which no option replaces
             left_out = Mend(columns={"coordinates": ""})
             found = [replace(f, mend=f.mend | left_out) if f.mend and f.mend.coordinates else f for f in found]
-        judged = raw.how.judged(found, raw.found.names)
+        judged = raw.how.judged(found, raw.found.names, raw.within)
         return tuple(replace(finding, what=f"{raw.path}: {finding.what}") for finding in judged)
 
     def _poses(self, rows: IntArray, moment: IntArray, count: int) -> FloatArray | None:
@@ -225,7 +225,7 @@ def raw_table(
     """Return the columns of a table that have a meaning among `columns`, in order of time if they have times.
 
     how     what it takes to understand it; what is left out is found by the names of the columns
-    within  the argument of the program that is `how`, "" where its entries are arguments themselves
+    within  the argument of the program that is `how`
 
     Raises `InputError` for something else, and for columns that are missing, misspelt, or could be either of two.
     """
@@ -295,18 +295,14 @@ def tell(findings: Sequence[Finding], raw: RawTable, depth: int) -> None:
 
     Raises `InputError` for all that contradicts how it is read, with the arguments that mend it.
     """
-    how, names, within = raw.how, raw.found.names, raw.within
     known = {finding.kind: finding for finding in reversed(findings)}
-    found = []
-    for each in known.values():
-        option = "" if each.mend is None else how.option_for(each.mend, names, within)
-        found.append(replace(each, what=each.what.removeprefix(f"{NAME}: "), option=option))
-    refuse_contradictions(found, option_text({"as_given": True}, within))
+    found = [replace(each, what=each.what.removeprefix(f"{NAME}: ")) for each in known.values()]
+    refuse_contradictions(found, option_text({"as_given": True}, raw.within))
     for each in found:
         warnings.warn(str(each), stacklevel=depth)
     if raw.clock.guessed:
         unit = raw.clock.unit
-        says = option_text({"units": {"time": unit}}, within)
+        says = option_text({"units": {"time": unit}}, raw.within)
         warnings.warn(f"times are read as {unit}, by their size; {says} says so", stacklevel=depth)
 
 

@@ -24,6 +24,7 @@ from saga_fg.numerics import BoolArray, FloatArray, yaw_transform
 from saga_fg.tables import (
     BOX,
     COLUMNS,
+    COMMAND,
     POSE,
     QUATERNION,
     REQUIRED,
@@ -50,18 +51,22 @@ def read_detections(path: str | Path, how: TableImport | None = None) -> Detecti
 
 
 def read_scenes_in_parts(
-    path: str | Path, rows: int = ROWS, scenes: Collection[str] | None = None, how: TableImport | None = None
+    path: str | Path,
+    rows: int = ROWS,
+    scenes: Collection[str] | None = None,
+    how: TableImport | None = None,
+    quiet: bool = False,
 ) -> Iterator[Scene]:
     """The scenes of a table as they come, each as successive `Scene`s of about `rows` rows: without holding them all.
 
-    scenes: the names of those wanted, None for all
+    scenes: the names of those wanted, None for all; quiet: nothing is said of columns and clock
 
     Raises `InputError` as `read_detections` does, when it comes to the row; where a scene goes on after another; and at
     the end, for names that did not come.
     """
     done: set[str] = set()
     name, latest, with_poses = "", -np.inf, None
-    for table in read_raw_parts(Path(path), how=how, rows=rows):
+    for table in read_raw_parts(Path(path), how=how, rows=rows, quiet=quiet):
         part = DetectionTable(table, judged=with_poses is None)
         if with_poses not in (None, part.with_poses):
             raise InputError(f"{path}: {table.where(0)}: ego_x, ego_y, ego_yaw: expected in all rows or in none")
@@ -87,7 +92,7 @@ def read_scenes_in_parts(
 
 def dense_traffic_of(path: Path, how: TableImport) -> str:
     """Why the first rows of a table look like dense road traffic, "" if they do not."""
-    first = next(read_scenes_in_parts(path, how=how), None)
+    first = next(read_scenes_in_parts(path, how=how, quiet=True), None)
     return "" if first is None else seems_dense_traffic(first.frames)
 
 
@@ -295,9 +300,10 @@ class TruthTable:
         return Scene(name, times, poses, ("",) * len(times), (), truth)
 
 
-def read_truth(path: str | Path, how: TableImport | None = None) -> TruthTable:
-    """Read a table of true objects. Raises `InputError` naming file, row and column."""
-    return TruthTable.from_table(read_raw_table(Path(path), Layout(TRUTH_COLUMNS, TRACK_REQUIRED, lenient=True), how))
+def read_truth(path: str | Path, how: TableImport | None = None, within: str = COMMAND) -> TruthTable:
+    """Read a table of true objects; within: the option that is `how`. Raises `InputError` naming file, row, column."""
+    layout = Layout(TRUTH_COLUMNS, TRACK_REQUIRED, lenient=True, within=within)
+    return TruthTable.from_table(read_raw_table(Path(path), layout, how))
 
 
 def _scene_poses(rows: TrackRows, at: Sequence[int] | np.ndarray, moment: np.ndarray, pose: FloatArray) -> FloatArray:

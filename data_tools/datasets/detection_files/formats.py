@@ -4,9 +4,9 @@ import csv
 import logging
 import shlex
 import sys
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
 
@@ -16,6 +16,7 @@ from data_tools.files import SUFFIXES, arrow_columns, arrow_names, load_archive,
 from saga_fg.errors import InputError
 from saga_fg.tables import (
     COLUMNS,
+    COMMAND,
     NAMED,
     POSE,
     REQUIRED,
@@ -25,8 +26,10 @@ from saga_fg.tables import (
     TableImport,
     Values,
     as_names,
+    canonical,
     clock_of,
     meaning,
+    option_text,
     sorted_by_time,
     understood,
 )
@@ -35,6 +38,8 @@ log = logging.getLogger(__name__)
 
 Row = TypeVar("Row")
 ROWS = 50_000  # of a part of a table
+OF_FRAMES = frozenset(("scene", "timestamp", "sensor", "coordinates", *POSE))
+DEEPEST = 8  # levels of a JSON object that are taken apart
 TRACK_MEANINGS = ("id",)  # of tracks, which need no word where detections are read
 _OPEN_QUOTE = "a quote is opened and not closed on this line"
 
@@ -45,12 +50,14 @@ class Layout:
 
     lenient  a column that --columns names need not be there
     faulty   columns that are missing or misspelt are no error where some are understood
+    within   how its options are named, as of `option_text`
     """
 
     columns: tuple[str, ...] = COLUMNS
     required: tuple[str, ...] = REQUIRED
     lenient: bool = False
     faulty: bool = False
+    within: str = COMMAND
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,7 @@ class _Reading:
     def understood(self, names: Collection[str]) -> Columns:
         """The columns of the file by their meaning. Raises `InputError` for all that is wrong with their names."""
         wanted, layout = self.hint(names).columns, self.layout
-        found = understood(names, layout.columns, layout.required, wanted, layout.lenient)
+        found = understood(names, layout.columns, layout.required, wanted, layout.lenient, layout.within)
         if found.faults and not (layout.faulty and found.names):
             raise InputError(f"{self.path}: {'; '.join(found.faults)}")
         return found
@@ -95,26 +102,31 @@ def read_raw_parts(
     how: TableImport | None = None,
     rows: int = ROWS,
     own: Collection[str] | None = None,
+    quiet: bool = False,
 ) -> Iterator[RawTable]:
     """Read a table in parts of about `rows` rows, in their order; rows of one scene and time stay together.
 
     A file without rows is one empty part; a table that is no text, or is to be sorted, is one part. Columns
-    that nobody gives in a part are missing from it. Warns of columns that are not read, and of a clock that is guessed.
+    that nobody gives in a part are missing from it. Unless `quiet`, warns of columns that are not read, and of a clock
+    that is guessed.
     """
     how = how or TableImport()
     clock: Clock | None = None
     told: set[str] = set()
     reading = _Reading(path, layout or Layout(), how, sys.maxsize if how.sort else rows, own)
     for table in _tables(reading):
+        table = replace(table, within=reading.layout.within)
         if clock is None and table.length:
             clock = clock_of(table)
-            _tell(table, clock)
+            if not quiet:
+                _tell(table, clock)
         unread = set(table.found.unread) - told - set(TRACK_MEANINGS)
-        if unread:
+        if unread and not quiet:
             names = [name[:40] for name in sorted(unread)]
             more = f", ... ({len(names)} in all)" if len(names) > 12 else ""
-            text = "%s: columns without a meaning here, not read: %s; --columns OURS=THEIRS reads one"
-            log.warning(text, path, ", ".join(names[:12]) + more)
+            reads = option_text({"columns": {"OURS": "THEIRS"}}, table.within)
+            shown = ", ".join(names[:12]) + more
+            log.warning("%s: columns without a meaning here, not read: %s; %s reads one", path, shown, reads)
         told |= unread
         table = replace(table, clock=clock or Clock())
         yield sorted_by_time(table) if how.sort else table
@@ -157,8 +169,8 @@ def _tell(table: RawTable, clock: Clock) -> None:
             log.info("%s: %s is read from %r, in %s", table.path, ours, theirs, table.found.units.get(ours, "our unit"))
     if clock.guessed:
         long = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}[clock.unit]
-        text = "%s: times are read as %s, by their size; --units time=%s says so"
-        log.warning(text, table.path, long, clock.unit)
+        says = option_text({"units": {"time": clock.unit}}, table.within)
+        log.warning("%s: times are read as %s, by their size; %s says so", table.path, long, says)
 
 
 def _read_csv(reading: _Reading) -> Iterator[RawTable]:
@@ -218,7 +230,7 @@ def _read_ndjson(reading: _Reading) -> Iterator[RawTable]:
             names = set().union(*rows)
             if not rows:
                 names = set(layout.columns)
-            if not rows or not names - {"scene", "timestamp", "sensor", "coordinates", *POSE}:  # every frame is empty
+            if not rows or {canonical(name) for name in names} <= OF_FRAMES:  # every frame is empty
                 names |= {"x", "y"}
             found = reading.understood(names)
             columns: dict[str, Values] = {
@@ -234,7 +246,50 @@ def _json_rows(path: Path, file: TextIO) -> Iterator[tuple[int, dict[str, Any]]]
         row = parsed_json(line, f"{path}: line {number}")
         if not isinstance(row, dict):
             raise InputError(f"{path}: line {number}: expected an object, got {line.strip()[:40]!r}")
-        yield number, row
+        if not any(isinstance(value, dict | list) for value in row.values()):
+            yield number, row
+            continue
+        of_frame, lists = _plain_values((), row)
+        if len(lists) > 1:
+            raise InputError(f"{path}: line {number}: expected one list of objects, got {', '.join(sorted(lists))}")
+        for entry in next(iter(lists.values()), [{}]):
+            own, deeper = _plain_values((), entry)
+            if deeper:
+                raise InputError(f"{path}: line {number}: {min(deeper)}: expected no list of objects in an object")
+            yield number, {**of_frame, **own}
+
+
+def _plain_values(
+    within: tuple[str, ...], values: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, list[dict[str, Any]]]]:
+    """The values of a JSON object by their names in a table, and its lists of objects; a vector has x, y and z."""
+    plain: dict[str, Any] = {}
+    lists: dict[str, list[dict[str, Any]]] = {}
+    for key, value in values.items():
+        path = (*within, key)
+        if value == [] and meaning(key) is None:
+            continue  # a frame without objects
+        if value and isinstance(value, list) and all(isinstance(each, dict) for each in value):
+            lists[key] = value
+        elif value and isinstance(value, dict | list) and len(path) < DEEPEST:
+            parts = value if isinstance(value, dict) else dict(zip("xyz", value, strict=False))
+            deeper = _plain_values(path, parts)
+            plain |= deeper[0]
+            lists |= deeper[1]
+        else:
+            plain[_joined(path)] = value
+    return plain, lists
+
+
+@lru_cache(1024)
+def _joined(path: tuple[str, ...]) -> str:
+    """Name of a nested value, as short as it takes to have a meaning: box.position.x is position_x, box.length length.
+
+    What is said of the vehicle (ego) keeps its whole name, and x its owner's.
+    """
+    shortest = len(path) - (1 if len(path[-1]) > 1 else 2)
+    names = ["_".join(path[start:]) for start in range(1 if path[0].startswith("ego") else shortest + 1)]
+    return next((name for name in names if meaning(name) is not None), "_".join(path))
 
 
 def _parts(

@@ -54,6 +54,7 @@ from saga_fg.tables import (
     TableImport,
     box_columns,
     findings_of,
+    option_text,
 )
 from saga_fg.types import (
     POSITION_COVARIANCE,
@@ -246,7 +247,7 @@ def read_tracks(
 def log_findings(findings: Sequence[Finding], raw: RawTable) -> None:
     """Log what is doubtful in a file; raises `InputError` for what contradicts how it is read."""
     with error_context(str(raw.path)):
-        refuse_contradictions(findings)
+        refuse_contradictions(findings, option_text({"as_given": True}, raw.within))
     for finding in findings:
         log.warning("%s: %s", raw.path, finding)
 
@@ -269,7 +270,7 @@ def track_rows(raw: RawTable, tell: Callable[[Sequence[Finding], RawTable], None
         in_world = (raw.texts("coordinates", raw.how.coordinates or "world") == "world")[mine]
         yaw = raw.numbers("yaw")[mine]
         sample = Sample.from_rows(timestamp[mine], found.boxes.select(mine), found.score[mine], yaw, in_world)
-        tell(raw.how.judged([*raw.findings(), *findings_of(sample)], raw.found.names), raw)
+        tell(raw.how.judged([*raw.findings(), *findings_of(sample)], raw.found.names, raw.within), raw)
     return TrackRows(
         scene=scene,
         timestamp=timestamp[kept],

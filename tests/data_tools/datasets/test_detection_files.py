@@ -109,13 +109,43 @@ def test_csv_and_ndjson_agree(tmp_path_factory, table):
         writer.writeheader()
         writer.writerows(named)
     (folder / "t.jsonl").write_text("\n".join(map(json.dumps, named)))
-    one, other = (read_detections(folder / f"t.{suffix}").scene("t").frames for suffix in ("csv", "jsonl"))
-    assert [(f.timestamp, f.sensor) for f in one] == [(f.timestamp, f.sensor) for f in other]
+    frames = [
+        {
+            "header": {"stamp": time},
+            "sensor": sensor,
+            "objects": [
+                {"box": {"center": {"x": box[0], "y": box[1]}, "size": {"length": box[2]}}, "tags": ["a"], "parts": []}
+                for t, s, box in table
+                if (t, s) == (time, sensor) and box is not None
+            ],
+        }
+        for time, sensor in sorted({(t, s) for t, s, _ in table})
+    ]
+    (folder / "t.ndjson").write_text("\n".join(map(json.dumps, frames)))
+    one, *others = (read_detections(folder / f"t.{suffix}").scene("t").frames for suffix in ("csv", "jsonl", "ndjson"))
     assert [(f.timestamp, f.sensor) for f in one] == sorted({(t, s) for t, s, _ in table})
     assert sum(map(len, one)) == sum(box is not None for _, _, box in table)
-    for a, b in zip(one, other, strict=True):
-        np.testing.assert_array_equal(a.detections.boxes.position, b.detections.boxes.position)
-        np.testing.assert_array_equal(a.detections.boxes.size, b.detections.boxes.size)
+    for other in others:
+        assert [(f.timestamp, f.sensor) for f in one] == [(f.timestamp, f.sensor) for f in other]
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_array_equal(a.detections.boxes.position, b.detections.boxes.position)
+            np.testing.assert_array_equal(a.detections.boxes.size, b.detections.boxes.size)
+
+
+def test_nested_values_have_the_names_of_columns(tmp_path):
+    """A vector has x, y and z; what is said of the vehicle is not taken for the object's."""
+    frame = {
+        "time": 1.0,
+        "ego": {"x": 5.0, "y": 6.0, "yaw": 0.0},
+        "objects": [
+            {"class": "car", "pose": {"position": [1, 2, 3], "yaw": 0.5}, "velocity": [4, 5], "feature": [9] * 5}
+        ],
+    }
+    scene = read_detections(write(tmp_path, ".ndjson", json.dumps(frame))).scene("drive")
+    boxes = scene.frames[0].detections.boxes
+    assert (boxes.label.tolist(), boxes.position.tolist(), boxes.yaw.tolist()) == (["car"], [[1, 2, 3]], [0.5])
+    assert (boxes.velocity.tolist(), np.isnan(boxes.size).all()) == ([[4, 5]], True)
+    assert scene.world_T_ego[0, :2, 3].tolist() == [5, 6]
 
 
 def test_a_column_without_a_meaning_is_named_in_a_warning(tmp_path, caplog):
@@ -238,6 +268,9 @@ BROKEN_NDJSON = [
     (FIRST + '{"x": 1, "y": 1}', "line 2: timestamp: expected a finite number of seconds, it is left out"),
     (FIRST + '{"timestamp": 1, "x": 1' + "0" * 400 + ', "y": 1}', "line 2: x: expected a finite number, got inf"),
     (FIRST + "[" * 100_000, "line 2: broken or truncated JSON"),
+    ('{"t": 0, "a": [{"x": 1}], "b": [{"x": 1}]}', "line 1: expected one list of objects, got a, b"),
+    ('{"t": 0, "a": [{"parts": [{"x": 1}]}]}', "line 1: parts: expected no list of objects in an object"),
+    ('{"a": ' * 900 + "1" + "}" * 900, "expected a column 'timestamp' and a column 'x' and a column 'y'"),
     ("", "expected at least one row"),
 ]
 
