@@ -15,9 +15,9 @@ from saga_fg.errors import unknown_name
 from saga_fg.model import Following, LearnedInteractions, Neighbours
 from saga_fg.settings import settings_group
 from saga_fg.tracking import AssociationName, ClassSettings, GreedySettings, Observer, dense_traffic_settings
+from saga_fg.tracking import Method as Method
 from saga_fg.types import DEFAULT, class_settings
 
-Method = Literal["saga", "kf", "centerpoint"]
 METHODS: tuple[Method, ...] = get_args(Method)
 Family = Literal["nuscenes", "kitti", "simulated", "heterogeneous", "traffic", "dense", "file"]
 
@@ -78,10 +78,7 @@ class TrackConfig:
 
     def of_method(self, method: Method) -> TrackConfig:
         """Return a copy for a method: without edges, trails and lanes, unless it is `saga`."""
-        if method == "saga":
-            return self
-        alone = replace(self.tracker, edges=(), traffic=replace(self.tracker.traffic, reach=0.0))
-        return replace(self, tracker=alone)
+        return replace(self, tracker=self.tracker.of_method(method))
 
 
 def load_interactions(path: Path) -> LearnedInteractions:

@@ -25,7 +25,7 @@ from data_tools.datasets.detection_files import prediction_writer, predictions_p
 from saga_fg import Dataset, GreedyTracker, InputError, PredictedTracks, Scene, Tracker, Tracks
 from saga_fg.numerics import FloatArray
 from saga_fg.tracking import SensorTime, Stage, TrackerView
-from saga_fg.types import LONGEST_PREDICTION
+from saga_fg.types import within_reach
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc
 LARGE = 2**18  # bytes
@@ -95,11 +95,6 @@ class TrackedScene:
         """Number of frames that were taken in."""
         return len(self.milliseconds)
 
-    @property
-    def seconds(self) -> float:
-        """Time spent in the tracker."""
-        return sum(self.milliseconds) / 1e3
-
 
 def track_scene(
     scene: Scene, tracker: OnlineTracker, progress: Progress | None = None, horizons: FloatArray | None = None
@@ -140,10 +135,8 @@ def _predicted(
     """The tracks at times after a moment; none where the newest frame is too far from it."""
     if isinstance(tracker, GreedyTracker):
         raise InputError("--predict: expected a method that predicts, saga or kf")
-    since = horizons + (moment - newest)
-    if since[0] < 0 or since[-1] > LONGEST_PREDICTION:
-        return ()
-    return (tracker.predict(horizons, since=moment),)
+    reached = within_reach(horizons + (moment - newest))
+    return (tracker.predict(horizons, since=moment),) if reached else ()
 
 
 def track_dataset(

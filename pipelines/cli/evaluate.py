@@ -61,11 +61,12 @@ def _evaluate(
     """
     _require_truth(source)
     if result is None:
-        settings = tracker.configured(options.family_of(source, config), config)
+        settings = tracker.configured(options.family_of(source, config, tracker.method), config)
         found, innovations = _tracked(source, settings, tracker.method)
     else:
         given = {name: value for name, value in vars(tracker).items() if value != getattr(TrackerOptions, name)}
-        for name, value in (given | ({} if config is None else {"config": config})).items():
+        others = {"config": config, "like": getattr(source, "like", None)}
+        for name, value in (given | {name: value for name, value in others.items() if value is not None}).items():
             raise InputError(f"--{name} {value}: goes without a result, which is made by it")
         with working("reading"):
             found, innovations = source.read_results(result), {}
@@ -118,7 +119,7 @@ def _evaluate_labels(
     table = _table(result)
     rows = read_tracks(table, labels=True)
     scenes = np.unique(rows.scene).tolist()
-    settings = load_smooth_config(source.family, config)
+    settings = load_smooth_config(options.family_of(source, config, method), config)
     chosen = source.restricted(scenes) if scenes else source
     with chosen.open(truth=True) as dataset, progress_bar(len(scenes)) as progress:
         found = evaluate_labels(rows, table, dataset, settings, method, progress)
@@ -184,7 +185,7 @@ def _benchmark(
     if not source.written.all_tracks:
         raise InputError(f"benchmark {source.name}: expected a dataset with official results: saga-fg benchmark --help")
     options.apart(output, *input_files(source))
-    task = TrackTask(tracker.configured(options.family_of(source, config), config), tracker.method, source)
+    task = TrackTask(tracker.configured(source.family, config), tracker.method, source)
     run = run_at_scale(source, task, output, scale)
     exit_on_failures(run)
     with working("writing the submission"):

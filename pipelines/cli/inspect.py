@@ -89,7 +89,7 @@ def inspect_table(
         typer.echo("\nPositions are taken for world coordinates; if the vehicle is their origin: --coordinates ego")
     if survey.dense_traffic and not survey.has_identities:
         typer.echo(
-            f"\nDense road traffic: {survey.dense_traffic}. `track` takes settings for it, with --like plain not."
+            f"\nDense road traffic: {survey.dense_traffic}. `track`, `smooth` have settings for it; --like plain: not."
         )
     base_option = "" if import_file is None else f" --import {shlex.quote(str(import_file))}"
     _show_next(survey, table, base_option + _mended(survey, findings, given).options())

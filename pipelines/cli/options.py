@@ -118,13 +118,13 @@ class TrackerOptions(MethodOptions):
         return settings.with_estimator(self.estimator, self.lag)
 
 
-def family_of(source: DatasetSource, config: Path | None) -> str | Path:
+def family_of(source: DatasetSource, config: Path | None, method: Method) -> str | Path:
     """The shipped settings that fit a dataset, which the file `config` lies over.
 
     A table has those that `--like` names. One of dense traffic has its own, which is told. With such a file, whose
-    meaning depends on no data, it is told how to have them.
+    meaning depends on no data, it is told how to have them. The method centerpoint has settings of its own.
     """
-    if not isinstance(source, DetectionFileSource):
+    if not isinstance(source, DetectionFileSource) or method == "centerpoint":
         return source.family
     if source.like is not None:
         return "dense" if source.like == "dense" else source.family

@@ -251,7 +251,7 @@ def _run(
     bounds = StreamSettings() if service.limits is None else load_settings(StreamSettings, service.limits)
     if service.reorder is not None:
         bounds = replace(bounds, reorder=service.reorder)
-    undecided = service.like is None and config is None
+    undecided = service.like is None and config is None and method != "centerpoint"
     checks = Checks(settings.of_method(method), load_config(family), option_for, undecided)
     stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), bounds, checks, **answers)
     return_large_blocks()

@@ -80,7 +80,6 @@ class Summary:
     scenes: int = 0
     frames: int = 0
     boxes: int = 0
-    seconds: float = 0.0
     best_score: dict[tuple[str, int], float] = field(default_factory=dict)  # of each track, by scene and id
     milliseconds: dict[str, tuple[float, ...]] = field(default_factory=dict)
     classes: set[str] = field(default_factory=set)
@@ -92,7 +91,6 @@ class Summary:
         for run in runs:
             self.scenes += 1
             self.frames += run.frames
-            self.seconds += run.seconds
             self.milliseconds[run.scene.name] = run.milliseconds
             if run.clocks:
                 self.clocks[run.scene.name] = run.clocks
@@ -115,8 +113,9 @@ class Summary:
         )
 
     def show(self) -> None:
-        """Print the line on stdout."""
-        rate = f", {self.frames / self.seconds:.0f} frames/s" if self.seconds > 0 else ""
+        """Print the line on stdout; a frame takes the median, which compilation does not move."""
+        milliseconds = [ms for of_scene in self.milliseconds.values() for ms in of_scene]
+        rate = f", {1e3 / np.median(milliseconds):.0f} frames/s" if milliseconds else ""
         sure = sum(score > 0.5 for score in self.best_score.values())
         tracks = f"{counted(len(self.best_score), 'track')} ({sure} with a score above 0.5)"
         counts = (counted(self.scenes, "scene"), counted(self.frames, "frame"), tracks, counted(self.boxes, "box"))
@@ -168,7 +167,8 @@ def _track(
     verbose: options.Verbose = False,
 ) -> None:
     """Track the detections of recordings."""
-    family, method = options.family_of(source, config), tracker.method
+    method = tracker.method
+    family = options.family_of(source, config, method)
     settings = tracker.configured(family, config)
     options.apart(output, *input_files(source))
     options.check_learn_offsets(beside.learn_offsets, method, scale.wanted)
@@ -256,7 +256,8 @@ def _smooth(
     tracks of other trackers are refined: joined, cut, filled and smoothed.
     """
     method = labels.method
-    settings = smoothing.load_smooth_config(source.family, config)
+    family = options.family_of(source, config, method)
+    settings = smoothing.load_smooth_config(family, config)
     settings = replace(settings, tracking=labels.over(settings.tracking))
     options.apart(output, *(labels.tracks or ()), *([labels.corrections] if labels.corrections else ()))
     corrections = read_corrections(labels.corrections) if labels.corrections else ()
@@ -264,7 +265,7 @@ def _smooth(
     given = read_given_tracks(source, labels.tracks or ())
     settings = smoothing.for_given_tracks(settings, given)
     record = LabelRun.of_command(source, method, settings, labels.tracks, labels.corrections).record
-    usual = smoothing.load_smooth_config(source.family).tracking
+    usual = smoothing.load_smooth_config(family).tracking
     checks = Checks(settings.tracking.of_method(method), usual, source.option_for)
     if scale.wanted:
         checks.see_first(source)

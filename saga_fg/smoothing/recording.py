@@ -48,7 +48,7 @@ from saga_fg.smoothing.passes import SmoothedObjects, smooth_objects, track_evid
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME, SmoothingSettings
 from saga_fg.smoothing.states import LabelCounts, Labels
 from saga_fg.tables import Table, TableImport, table_like
-from saga_fg.tracking import GreedyTracker, Tracker, TrackerSettings, read_scenes, scaled_sensors
+from saga_fg.tracking import GreedyTracker, Like, Method, Tracker, TrackerSettings, read_scenes, scaled_sensors
 from saga_fg.types import Frame
 
 MIN_LENGTH = 5.0  # s, of a chunk that ends early: below the margins at its ends, which are smoothed again, take over
@@ -148,6 +148,10 @@ class LabelModel:
     smoothing: SmoothingSettings = field(default_factory=SmoothingSettings)
     providers: Sequence[FactorProvider] = ()
     corrections: Sequence[Correction] = ()
+
+    def __post_init__(self) -> None:
+        if not self.smoothing.edges:
+            vars(self)["tracker"] = replace(self.tracker, edges=())
 
 
 @dataclass(frozen=True, eq=False)
@@ -423,23 +427,29 @@ def smooth(
     smoothing: SmoothingSettings | None = None,
     corrections: Iterable[Correction | Mapping[str, Any]] = (),
     how: TableImport | None = None,
+    like: Like | None = None,
+    method: Method = "saga",
+    estimator: str | None = None,
 ) -> TableLabels:
     """Label a table of detections, of pandas, Polars or Arrow, with past and future of every object.
 
-    detections, settings, sensors  as `saga_fg.track` takes them
-    smoothing    settings of the passes over the whole table
+    detections, settings, sensors, how, like, method, estimator  as of `saga_fg.track`; by default labels begin with an
+                 object's first detection
+    smoothing    settings of the passes over the whole table; by default without edges where traffic is dense
     corrections  by a person, as `Correction` or as a mapping like a line of a file of corrections
-    how          what it takes to understand the table: columns, classes, units, coordinates
 
     Warns (`UserWarning`) as `saga_fg.track` does, and of each correction that does not hold. Raises `InputError` for a
     table or a correction that can't be used.
     """
     given = checked_corrections(corrections)
-    found = read_scenes(detections, how or TableImport(), settings or TrackerSettings(min_hits=2), sensors, "how")
+    found = read_scenes(detections, how, settings, sensors, like, method, estimator)
+    if settings is None:
+        found = found._replace(settings=replace(found.settings, min_hits=1))
     labels, outcomes = {}, []
+    smoothing = SmoothingSettings(edges=found.like == "plain") if smoothing is None else smoothing
     for scene in found.scenes:
         mine = corrections_in(scene.name, given)
-        model = LabelModel(found.settings, found.sensors, smoothing or SmoothingSettings(), (), mine)
+        model = LabelModel(found.settings, found.sensors, smoothing, (), mine)
         builder = LabelBuilder(found.new_tracker(), model)
         builder.add(scene.frames, scene.timestamps)
         labels[scene.name], _ = builder.finish()

@@ -58,6 +58,11 @@ class SmoothingSettings(Settings):
     classes: Mapping[str, OfflineClass] = settings_group(
         lambda: {DEFAULT: OfflineClass()}, "settings by class of object; the entry named default serves all others"
     )
+    edges: bool = setting(
+        True,
+        "whether edges act in the passes over the recording too; false: online alone, where detections are dense and a "
+        "follower's own past and future say more than its leader",
+    )
     max_gap: NonNegative = setting(
         3.0, "longest gap between two tracklets of one object, s; higher: more links, right and wrong"
     )

@@ -17,10 +17,11 @@ from .settings import (
     ClassSettings,
     EgoNodeSettings,
     ExistenceSettings,
+    Method,
     TrackerSettings,
     TypicalSize,
 )
-from .table_tracking import IdentityTracker, dense_traffic_settings, predict, read_scenes, track
+from .table_tracking import IdentityTracker, Like, dense_traffic_settings, predict, read_scenes, track
 from .track_filters import MOVING, Kinematics, TurnRate
 from .track_table import SensorEvidence, TrackTable
 from .tracker import Tracker
@@ -45,6 +46,8 @@ __all__ = [
     "JointTrackState",
     "Journal",
     "Kinematics",
+    "Like",
+    "Method",
     "Observer",
     "Passages",
     "SensorEvidence",

@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple, Protocol
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal, NamedTuple, Protocol, Self
 
 from saga_fg.errors import InputError
 from saga_fg.graph import FactorProvider
@@ -49,6 +49,7 @@ from saga_fg.tracking.clock import MAX_JUMP
 from saga_fg.tracking.traffic import TrafficSettings
 from saga_fg.types import DEFAULT, Boxes, RoadMap, SignalSettings
 
+Method = Literal["saga", "kf", "centerpoint"]
 AssociationName = Literal["hungarian", "greedy", "graph"]
 
 
@@ -305,6 +306,10 @@ class TrackerSettings(Settings):
     report_out_of_view: bool = setting(
         False, "true: report tracks outside every field of view as well, as long as the other limits let them"
     )
+
+    def of_method(self, method: Method) -> Self:
+        """Return a copy for a method: without edges, trails and lanes, unless it is `saga`."""
+        return self if method == "saga" else replace(self, edges=(), traffic=replace(self.traffic, reach=0.0))
 
     def nonlinear(self, rules: Sequence[EdgeRule]) -> bool:
         """Return True if a class moves nonlinearly or an edge rule is nonlinear."""

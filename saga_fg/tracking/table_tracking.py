@@ -13,8 +13,9 @@ import copy
 import warnings
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,11 +46,13 @@ from saga_fg.tables import (
     table_like,
     tell,
 )
-from saga_fg.tracking.settings import AssociationSettings, ClassSettings, TrackerSettings
+from saga_fg.tracking.greedy import GreedyTracker
+from saga_fg.tracking.settings import AssociationSettings, ClassSettings, Method, TrackerSettings
 from saga_fg.tracking.tracker import Tracker
 from saga_fg.tracking.traffic import TrafficSettings
 from saga_fg.types import (
     DEFAULT,
+    LONGEST_PREDICTION,
     Detections,
     Frame,
     PredictedTracks,
@@ -57,6 +60,7 @@ from saga_fg.types import (
     SignalSettings,
     Tracks,
     checked_horizons,
+    within_reach,
 )
 
 
@@ -105,6 +109,9 @@ def dense_traffic_settings() -> TrackerSettings:
     )
 
 
+Like = Literal["plain", "dense"]
+"""Settings that begin with a table: those for dense road traffic, or the plain ones."""
+
 UNKNOWN_SENSORS: Mapping[str, Sensor] = {DEFAULT: Sensor(calibrate_noise=True, clutter_area=5000.0)}
 """Models of sensors of which nothing is known: their detections tell how noisy they are, and their scores how many of a
 frame are false."""
@@ -117,33 +124,31 @@ def track(
     detections: Table,
     settings: TrackerSettings | None = None,
     sensors: Mapping[str, Sensor] | None = None,
-    columns: Mapping[str, str] | None = None,
-    classes: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    coordinates: Literal["", "world", "ego", "sensor", "camera"] = "",
-    as_given: bool = False,
+    how: TableImport | None = None,
+    like: Like | None = None,
+    method: Method = "saga",
+    estimator: str | None = None,
 ) -> Table:
     """Track a table of detections, of pandas, Polars or Arrow, and return one of tracks, a row for each and moment.
 
-    detections   a row for each: timestamp (s, or dates), x, y (m), and where known z, label, score, sensor, length,
-                 width, height, yaw (rad), vx, vy, range_rate, cov_xx, cov_xy, cov_yy (m^2), scene, and ego_x,
-                 ego_y, ego_yaw, the vehicle's pose; a row without x and y is a moment at which nothing was detected
-    settings     of the tracker; by default tracks are reported from their second detection on, and dense road traffic
-                 seen by a sensor that stands or hovers has settings of its own (`saga_fg.tracking.table_tracking`)
-    sensors      models by name of the sensor; by default the noise of each is told by its detections
-    columns      names of columns in the table, by ours, where they are not found: {"x": "pos_e"}
-    classes      our name of a class by that in the table, an empty one to leave its objects out
-    units        {"angle": "deg", "time": "ns", "speed": "km/h", ...}, as of `saga-fg track file --units`
-    coordinates  of positions, headings and velocities: world, ego, sensor or camera
-    as_given     read the table as these arguments say even where its contents contradict them
+    detections  a row for each: timestamp (s, or dates), x, y (m), and where known z, label, score, sensor, length,
+                width, height, yaw (rad), vx, vy, range_rate, cov_xx, cov_xy, cov_yy (m^2), scene, and ego_x,
+                ego_y, ego_yaw, the vehicle's pose; a row without x and y is a moment at which nothing was detected
+    settings    of the tracker; by default those that `like` names, or that fit the first scene
+    sensors     models by name of the sensor; by default the noise of each is told by its detections
+    how         what it takes to understand the table: columns, classes, units, coordinates, as_given
+    like        dense: settings for road traffic seen by a sensor that stands or hovers; plain: for all else, where
+                tracks are reported from their second detection on
+    method      saga, kf (without edges, trails and lanes), or centerpoint (greedy nearest centre, with settings of its
+                own)
+    estimator   kalman, isam2, fixed-lag, or one of your own, in place of that of the settings
 
     Frames are taken in order of time, each by what came before it. The table of tracks is of the same kind; it has a
     column `scene` if the detections have one, and each scene has a tracker of its own. Warns (`UserWarning`) of what is
     probably wrong, by the checks of `saga-fg inspect`. Raises `InputError` for a table that can't be used, and for one
     whose contents contradict how it is read: units of angles, times, lengths or speeds, coordinates, exchanged columns.
     """
-    how = TableImport(columns or {}, classes or {}, units or {}, coordinates, as_given=as_given)
-    found = read_scenes(detections, how, settings, sensors, "")
+    found = read_scenes(detections, how, settings, sensors, like, method, estimator)
     parts = []
     for scene in found.scenes:
         tracker = found.new_tracker()
@@ -161,11 +166,10 @@ def predict(
     modes: bool = False,
     settings: TrackerSettings | None = None,
     sensors: Mapping[str, Sensor] | None = None,
-    columns: Mapping[str, str] | None = None,
-    classes: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
-    coordinates: Literal["", "world", "ego", "sensor", "camera"] = "",
-    as_given: bool = False,
+    how: TableImport | None = None,
+    like: Like | None = None,
+    method: Method = "saga",
+    estimator: str | None = None,
 ) -> Table:
     """Predict where all tracks of a table of detections will be, and return a table: a row for each track and horizon.
 
@@ -176,39 +180,48 @@ def predict(
     modes       a row for each mode (moving, stationary), with `probability`; otherwise their mean and covariance
 
     The table is of the same kind, with the columns of `PredictedTracks.table_columns`, and `scene` if the detections
-    have one. Warns and raises as `track`, and for a time that is in no scene, or from which a horizon is more than 60 s
-    after the last frame before it.
+    have one. Warns and raises as `track`. Warns of times that are left out: those in no scene, and those from which a
+    horizon is more than 60 s after the last frame before it.
     """
-    how = TableImport(columns or {}, classes or {}, units or {}, coordinates, as_given=as_given)
     ahead, wanted = checked_horizons(horizons), None if times is None else np.sort(checked("times", times, (None,)))
-    found = read_scenes(detections, how, settings, sensors, "")
-    stamps = [found.stamps(scene) for scene in found.scenes]
-    spans = [(each[0], max(each)) for each in stamps]
-    for time in [] if wanted is None else wanted.tolist():
-        if not any(first <= time <= last for first, last in spans):
-            within = ", ".join(f"{first:.10g} to {last:.10g}" for first, last in spans[:6])
-            raise InputError(f"times: expected seconds within a scene ({within}), got {time:.10g}")
-    parts = []
-    for scene, of_scene, (first, last) in zip(found.scenes, stamps, spans, strict=True):
-        tracker, frames = found.new_tracker(), deque(zip(of_scene, scene.frames, strict=True))
+    if method == "centerpoint":
+        raise InputError("method: expected saga or kf, centerpoint predicts nothing")
+    found = read_scenes(detections, how, settings, sensors, like, method, estimator)
+    parts, left_out, spans = [], set(() if wanted is None else wanted.tolist()), []
+    for scene in found.scenes:
+        stamps = found.stamps(scene)
+        tracker, frames = Tracker(found.settings, found.sensors), deque(zip(stamps, scene.frames, strict=True))
+        first, last = stamps[0], max(stamps)
+        spans.append(f"{first:.10g} to {last:.10g}")
         here = np.array([last]) if wanted is None else wanted[(wanted >= first) & (wanted <= last)]
         for time in here.tolist():
             while frames and frames[0][0] <= time:
-                tracker.step(frames.popleft()[1])
-            parts.append(found.named(scene.name, tracker.predict(ahead, since=time).table_columns(modes)))
+                newest = tracker.step(frames.popleft()[1]).timestamp
+            if within_reach(ahead + (time - newest)):
+                parts.append(found.named(scene.name, tracker.predict(ahead, since=time).table_columns(modes)))
+                left_out.discard(time)
+    if left_out:
+        within = f"within a scene ({', '.join(spans[:6])}), at most {LONGEST_PREDICTION:g} s from a frame to a horizon"
+        some = ", ".join(f"{time:.10g}" for time in sorted(left_out)[:6])
+        warnings.warn(f"times: expected seconds {within}; left out: {some}", stacklevel=2)
     return table_like(detections, parts or [found.named("", PredictedTracks.empty(0.0, ahead).table_columns(modes))])
 
 
 class TableScenes(NamedTuple):
-    """The scenes of a table of detections, and how to track them; is_named: they have a column `scene`."""
+    """The scenes of a table of detections, and how to track them; is_named: they have a column `scene`; like: whose
+    settings fit them."""
 
     scenes: list[Scene]
     settings: TrackerSettings
     sensors: Mapping[str, Sensor]
     is_named: bool
+    method: Method
+    like: Like
 
-    def new_tracker(self) -> Tracker:
+    def new_tracker(self) -> Tracker | GreedyTracker:
         """Return a tracker for one of them."""
+        if self.method == "centerpoint":
+            return GreedyTracker(sensors=self.sensors)
         return Tracker(self.settings, self.sensors)
 
     def stamps(self, scene: Scene) -> list[float]:
@@ -223,33 +236,46 @@ class TableScenes(NamedTuple):
 
 def read_scenes(
     detections: Table,
-    how: TableImport,
+    how: TableImport | None,
     settings: TrackerSettings | None,
     sensors: Mapping[str, Sensor] | None,
-    within: str,
+    like: Like | None,
+    method: Method,
+    estimator: str | None,
 ) -> TableScenes:
-    """Read a table, within as of `raw_table`. Settings that are left out are those that fit its first scene.
+    """Read a table; arguments as of `track`. Settings that are left out are those that fit its first scene.
 
     Warns of those for dense traffic and of what is doubtful, at the caller's caller; raises as `tell`.
     """
+    for name, value, known in (("method", method, get_args(Method)), ("like", like or "plain", get_args(Like))):
+        if value not in known:
+            raise InputError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
     if settings is not None:
         require_type("settings", settings, TrackerSettings)
+        if like is not None:
+            raise InputError(f"like: expected None beside settings, got {like!r}")
+    if method == "centerpoint" and (settings, estimator) != (None, None):
+        raise InputError("settings, estimator: expected None with method='centerpoint', which has its own")
     sensors = UNKNOWN_SENSORS if sensors is None else checked_sensors(sensors)
-    raw = raw_table(detections, how, within=within)
+    raw = raw_table(detections, how)
     scenes = scenes_of(raw)
-    why = seems_dense_traffic(scenes[0].frames) if scenes and settings is None else ""
+    undecided = settings is None and like is None and method != "centerpoint"
+    why = seems_dense_traffic(scenes[0].frames) if scenes and undecided else ""
     if why:
-        plain = "settings=TrackerSettings(min_hits=2) takes the plain ones"
-        warnings.warn(f"settings for dense traffic: {why}; {plain}", stacklevel=3)
+        warnings.warn(f"settings for dense traffic: {why}; like='plain' takes others", stacklevel=3)
+    like = like or ("dense" if why else "plain")
     if settings is None:
-        settings = dense_traffic_settings() if why else TrackerSettings(min_hits=2)
+        settings = dense_traffic_settings() if like == "dense" else TrackerSettings(min_hits=2)
+    if estimator is not None:
+        settings = replace(settings, estimator=estimator)
+    settings = settings.of_method(method)
     frames = [frame for scene in scenes for frame in scene.frames]
     labels = {name for frame in frames for name in frame.detections.boxes.label.tolist()}
     logits = any(sensor_model(sensors, name).score == "logit" for name in {frame.sensor for frame in frames})
     findings = [one for scene in scenes for one in scene.findings or () if one.kind != "scores" or not logits]
     rules = idle_rules(acting_classes(settings.edges), labels - {UNNAMED})
-    tell([*findings, *([] if rules is None else [rules])], raw, depth=4)
-    return TableScenes(scenes, settings, sensors, "scene" in raw.columns)
+    tell([*findings, *raw.how.judged([] if rules is None else [rules], raw.found.names, raw.within)], raw, depth=4)
+    return TableScenes(scenes, settings, sensors, "scene" in raw.columns, method, like)
 
 
 D = TypeVar("D")

@@ -46,7 +46,16 @@ from saga_fg.tracking.update import (
     update_existence,
     update_tracks,
 )
-from saga_fg.types import LATEST, LONGEST_PREDICTION, Frame, PredictedTracks, Tracks, checked_horizons, finite_seconds
+from saga_fg.types import (
+    LATEST,
+    LONGEST_PREDICTION,
+    Frame,
+    PredictedTracks,
+    Tracks,
+    checked_horizons,
+    finite_seconds,
+    within_reach,
+)
 
 log = logging.getLogger(__name__)
 
@@ -264,7 +273,7 @@ class Tracker:
             raise InputError("predict: expected a frame before, there is no time to predict from")
         since = newest if since is None else finite_seconds(since)
         ahead = checked + (since - newest)
-        if ahead[0] < 0 or ahead[-1] > LONGEST_PREDICTION:
+        if not within_reach(ahead):
             got = f"{since + checked[0]:.10g} to {since + checked[-1]:.10g}"
             within = f"from the newest frame, at {newest:.10g} s, to {LONGEST_PREDICTION:g} s later"
             raise InputError(f"predict: expected times {within}, got {got}")

@@ -64,6 +64,7 @@ from .track import (
     known_velocities,
     speed_deviation,
     text_table,
+    within_reach,
 )
 
 __all__ = [
@@ -137,4 +138,5 @@ __all__ = [
     "text_table",
     "touching_pairs",
     "updated",
+    "within_reach",
 ]

@@ -386,6 +386,11 @@ class PredictedTracks(ShownTable):
         return f"{len(self)} tracks, predicted from {self.timestamp:.3f} s", {**first, **_placed(*rows)}
 
 
+def within_reach(ahead: FloatArray) -> bool:
+    """True for increasing times (H,) after the newest frame, s, to which tracks can be predicted."""
+    return bool(ahead[0] >= 0 and ahead[-1] <= LONGEST_PREDICTION)
+
+
 def checked_horizons(horizons: ArrayLike) -> FloatArray:
     """Return horizons (H,), s; `InputError` unless they increase, from 0 to `LONGEST_PREDICTION`, one at least."""
     if np.ndim(horizons) == 0:

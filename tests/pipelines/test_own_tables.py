@@ -1,9 +1,11 @@
 """Tables of one's own, and what looks wrong in them. From a stranger's table to a judged result."""
 
+import io
 import json
 import math
 import re
 import shlex
+import warnings
 from importlib.util import find_spec
 
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 from pipelines.config import load_config
 from pipelines.report.page import read_run_record
 from saga_fg import Boxes, Detections, Frame
+from saga_fg.smoothing import smooth as labelled
 from saga_fg.tracking import Tracker
 from saga_fg.types.road_map import RoadMap
 from tests.pipelines.strangers_tables import T0, rows, run_line, saga_fg, write
@@ -271,12 +274,12 @@ def test_settings_for_a_class_or_sensor_that_the_data_lack(tmp_path, caplog):
     table = write(tmp_path / "d.csv", rows()[0])
     config = tmp_path / "c.yaml"
     options = ("--sort", "--classes", "VEHICLE=car", "--units", "angle=deg,score=percent", "-o", tmp_path / "t.csv")
-    for name, warnings in (("Car", 2), ("car", 1)):
+    for name, expected in (("Car", 2), ("car", 1)):
         caplog.clear()
         config.write_text(f"tracker: {{classes: {{{name}: {{gate: 0.99}}}}}}\nsensors: {{lidar_top: {{}}}}\n")
         assert saga_fg("track", "file", table, "--config", config, *options).exit_code == 0
         told = [record.getMessage() for record in caplog.records]
-        assert len(told) == warnings, told
+        assert len(told) == expected, told
         assert told[-1].startswith("sensors.lidar_top has settings and the data have none of it; sensor have")
 
 
@@ -471,3 +474,39 @@ def test_dense_traffic_is_recognised_unless_it_is_said_otherwise(tmp_path):
     assert "--like dense takes those for dense traffic" in said
     assert "settings for" not in saga_fg("track", "file", table, "--like", "plain", "--output", same).output
     assert same.read_bytes() != told.read_bytes()
+    assert "settings for" not in saga_fg("track", "file", table, "--method", "centerpoint", "--output", same).output
+
+
+def test_labels_of_dense_traffic_begin_with_its_settings_as_those_of_a_program_do(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    table = tmp_path / "above.csv"
+    rows = [f"{k / 10},car,{k - 12 * n},{4 * (n % 2)},0.0,9" for k in range(20) for n in range(10) if n or k % 3]
+    table.write_text("\n".join(["timestamp,label,x,y,yaw,lane", *rows]) + "\n")
+    found = {}
+    for like in (None, "dense", "plain"):
+        options = () if like is None else ("--like", like)
+        said = saga_fg("smooth", "file", table, *options, "--output", tmp_path / f"labels-{like}")
+        assert said.exit_code == 0, said.output
+        assert said.output.count("settings for dense traffic: 10 vehicles at a time with headings") == (like is None)
+        assert said.output.count("not read: lane") == 1
+        found[like] = (tmp_path / f"labels-{like}" / "labels.csv").read_text()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            boxes = labelled(pandas.read_csv(table), like=like).boxes()
+        assert boxes.x.to_numpy() == pytest.approx(pandas.read_csv(io.StringIO(found[like])).x.to_numpy(), abs=1e-3)
+    assert found["dense"] == found[None] != found["plain"]
+    truth = tmp_path / "truth.csv"
+    truth.write_text(table.read_text().replace("lane", "id"))
+    judged = saga_fg("evaluate", "labels", "file", tmp_path / "labels-None", "--detections", table, "--truth", truth)
+    assert "settings for dense traffic" in judged.output
+
+
+def test_what_mends_the_truth_alone_is_named_by_its_own_option(tmp_path):
+    gt = write(tmp_path / "gt.csv", rows()[1])
+    how = tmp_path / "how.yaml"
+    how.write_text("classes: {VEHICLE: car}\n")
+    result = saga_fg("evaluate", "file", gt, "--units", "angle=deg", "--truth", gt, "--truth-import", how)
+    assert "add --truth-import (units: {angle: deg}); --truth-import (as_given: true) reads it" in result.output
+    how.write_text("classes: {VEHICLE: car}\nunits: {angle: deg}\n")
+    options = ("--units", "angle=deg", "--classes", "VEHICLE=car")
+    assert saga_fg("evaluate", "file", gt, *options, "--truth", gt, "--truth-import", how).exit_code == 0

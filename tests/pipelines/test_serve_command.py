@@ -316,6 +316,6 @@ def test_a_file_of_settings_decides_about_dense_traffic(tmp_path):
     frames = [{"timestamp": k / 10, "detections": each} for k, each in enumerate(cars)]
     stream, config = "\n".join(map(json.dumps, frames)).encode(), tmp_path / "c.yaml"
     config.write_text("tracker: {min_hits: 2}\n")
-    for options, told in (((), True), (("--config", str(config)), False)):
+    for options, told in (((), True), (("--config", str(config)), False), (("--method", "centerpoint"), False)):
         served = subprocess.run([*COMMAND, "serve", *options], input=stream, capture_output=True, check=True)
         assert ("add --like dense" in served.stderr.decode()) == told

@@ -36,6 +36,27 @@ def test_the_figures_are_those_of_the_command(tracks, tmp_path):
     assert found._repr_html_().count("<table>") > 2
 
 
+@pytest.mark.parametrize("options", [{"method": "kf"}, {"method": "centerpoint"}, {"estimator": "isam2"}])
+def test_methods_and_estimators_are_those_of_the_command(options, tmp_path):
+    table, result = tmp_path / "found.csv", tmp_path / "tracks.csv"
+    DETECTIONS.to_csv(table, index=False)
+    done(
+        "track",
+        "file",
+        table,
+        *(text for name, value in options.items() for text in (f"--{name}", value)),
+        "--output",
+        result,
+    )
+    found = saga_fg.track(DETECTIONS, **options)
+    expected = pd.read_csv(result)
+    pd.testing.assert_frame_equal(
+        found[["timestamp", "id", "x", "y"]], expected[["timestamp", "id", "x", "y"]], atol=1e-3
+    )
+    with pytest.raises(InputError, match="settings, estimator: expected None with method='centerpoint'"):
+        saga_fg.track(DETECTIONS, method="centerpoint", estimator="isam2")
+
+
 @pytest.mark.parametrize("kind", ["polars", "pyarrow"])
 def test_other_tables_are_judged_alike(kind, tracks):
     module = pytest.importorskip(kind)
@@ -122,20 +143,16 @@ def test_what_mends_a_table_is_named_as_each_function_takes_it(tracks, subtests)
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
                 call(**eval(f"dict({mend})", names))
-            assert {"as_given": True} in (
-                eval(f"dict({otherwise})", names),
-                vars_given(eval(f"dict({otherwise})", names)),
-            )
-
-
-def vars_given(arguments):
-    (how,) = arguments.values()
-    return how.values() if isinstance(how, TableImport) else None
+            (how,) = eval(f"dict({otherwise})", names).values()
+            assert how.values() == {"as_given": True}
 
 
 def test_a_column_that_is_not_found_is_named_as_the_function_takes_it(tracks):
     for call, text in [
-        (lambda: saga_fg.track(DETECTIONS.rename(columns={"x": "what"})), "name it: columns={'x': 'NAME'}"),
+        (
+            lambda: saga_fg.track(DETECTIONS.rename(columns={"x": "what"})),
+            "name it: how=TableImport(columns={'x': 'NAME'})",
+        ),
         (lambda: saga_fg.smooth(DETECTIONS.rename(columns={"x": "what"})), "how=TableImport(columns={'x': 'NAME'})"),
         (
             lambda: saga_fg.evaluate(tracks, TRUTH.rename(columns={"y": "what"}), truth_how=TableImport()),

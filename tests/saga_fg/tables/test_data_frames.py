@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import saga_fg
-from saga_fg import Detection, Detections, Frame, InputError, MissingExtraError, Tracker, Tracks
+from saga_fg import Detection, Detections, Frame, InputError, MissingExtraError, TableImport, Tracker, Tracks
 from saga_fg.tables.detections import frames_of
 
 pd = pytest.importorskip("pandas", reason="pandas comes with the extra pandas")
@@ -94,16 +94,20 @@ def test_tables_are_read_as_the_arguments_say():
     )  # fmt: skip
     tracks = saga_fg.track(
         foreign,
-        columns={"x": "east", "y": "north"},
-        classes={"PKW": "car"},
-        units={"time": "ms", "length": "cm", "angle": "deg", "speed": "km/h"},
+        how=TableImport(
+            columns={"x": "east", "y": "north"},
+            classes={"PKW": "car"},
+            units={"time": "ms", "length": "cm", "angle": "deg", "speed": "km/h"},
+        ),
     )
     pd.testing.assert_frame_equal(tracks, expected, rtol=1e-6, atol=1e-9)
     drive = 8.0 * rows.timestamp
     of_vehicle = rows.assign(ego_x=drive, ego_y=0.0, ego_yaw=0.0, x=rows.x - drive)
-    pd.testing.assert_frame_equal(saga_fg.track(of_vehicle, coordinates="ego"), expected, rtol=1e-6, atol=1e-9)
+    pd.testing.assert_frame_equal(
+        saga_fg.track(of_vehicle, how=TableImport(coordinates="ego")), expected, rtol=1e-6, atol=1e-9
+    )
     of_camera = of_vehicle.assign(x=-of_vehicle.y, y=1.5, z=of_vehicle.x, yaw=-0.1 - np.pi / 2)
-    found = saga_fg.track(of_camera.drop(columns=["vx", "vy"]), coordinates="camera")
+    found = saga_fg.track(of_camera.drop(columns=["vx", "vy"]), how=TableImport(coordinates="camera"))
     plain = saga_fg.track(rows.drop(columns=["vx", "vy"]))
     pd.testing.assert_frame_equal(found[["x", "y", "yaw"]], plain[["x", "y", "yaw"]], rtol=1e-6, atol=1e-9)
 
@@ -159,7 +163,7 @@ def test_what_is_probably_wrong_is_warned_of(subtests):
         (
             {"label": "REGULAR_VEHICLE"},
             r"no edges: tracker.edges act on .*car.*, and the tracks are of REGULAR_VEHICLE; .*; "
-            r"add classes=\{'REGULAR_VEHICLE': 'car'\}",
+            r"add how=TableImport\(classes=\{'REGULAR_VEHICLE': 'car'\}\)",
         ),
     ]:
         with subtests.test(message), pytest.warns(UserWarning, match=message):
@@ -177,14 +181,16 @@ def test_a_table_that_contradicts_how_it_is_read_is_refused_with_what_mends_it(s
         rows = table(label="car", **columns)
         wanted = ", ".join(f"{name}={value!r}" for name, value in mend.items())
         with subtests.test(wanted):
-            with pytest.raises(InputError, match=re.escape(f"; add {wanted}; as_given=True reads it as it is")):
+            given = "how=TableImport(as_given=True)"
+            mended = f"; add how=TableImport({wanted}); {given} reads it as it is"
+            with pytest.raises(InputError, match=re.escape(mended)):
                 saga_fg.track(rows)
             with pytest.warns(UserWarning, match=re.escape(wanted)):
-                saga_fg.track(rows, as_given=True)
+                saga_fg.track(rows, how=TableImport(as_given=True))
             if "length" not in str(mend):
                 with warnings.catch_warnings():
                     warnings.simplefilter("error")
-                    saga_fg.track(rows, **mend)
+                    saga_fg.track(rows, how=TableImport(**mend))
 
 
 def test_headings_of_a_compass_are_refused_with_and_without_velocities():
@@ -192,7 +198,7 @@ def test_headings_of_a_compass_are_refused_with_and_without_velocities():
     x, y = 20 * np.sin(angle), -20 * np.cos(angle)
     turning = pd.DataFrame({"timestamp": angle / 0.5, "label": "car", "x": x, "y": y, "yaw": np.pi / 2 - angle})
     for rows in (turning, turning.assign(vx=10 * np.cos(angle), vy=10 * np.sin(angle))):
-        message = r"headings look clockwise from north: .* add units=\{'angle': 'compass_rad'\}"
+        message = r"headings look clockwise from north: .* add how=TableImport\(units=\{'angle': 'compass_rad'\}\)"
         with pytest.raises(InputError, match=message):
             saga_fg.track(rows)
         with warnings.catch_warnings():

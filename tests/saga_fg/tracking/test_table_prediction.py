@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import saga_fg
-from saga_fg import ConstantVelocity, InputError, Sensor, Tracker, TrackerSettings
+from saga_fg import ConstantVelocity, InputError, Sensor, TableImport, Tracker, TrackerSettings
 from saga_fg.estimators.reference import Gaussian, kalman_predict, kalman_update
 from saga_fg.model import NoiseModel
 from saga_fg.tracking import ClassSettings
@@ -130,7 +130,7 @@ def test_modes_have_the_mean_and_covariance_of_their_mixture():
 def test_other_tables_give_tables_of_their_kind(kind):
     module, rows = pytest.importorskip(kind), traffic(2.0)
     made = module.DataFrame(rows.to_dict("list")) if kind == "polars" else module.Table.from_pandas(rows)
-    found = saga_fg.predict(made, [1.0], columns={"x": "x"})
+    found = saga_fg.predict(made, [1.0], how=TableImport(columns={"x": "x"}))
     assert type(found).__module__.startswith(kind)
     pd.testing.assert_frame_equal(found.to_pandas(), saga_fg.predict(rows, [1.0]), check_dtype=False)
 
@@ -154,32 +154,39 @@ def test_what_cannot_be_predicted_is_named(subtests):
         ({"horizons": [1.0, 0.5]}, "horizons: expected increasing seconds from 0 to 60"),
         ({"horizons": 1.0}, "horizons: expected a list of seconds"),
         ({"horizons": [61.0]}, "horizons: expected increasing seconds from 0 to 60"),
-        ({"times": [0.5, 7.0]}, "times: expected seconds within a scene (0 to 0.9), got 7"),
-        ({"times": [-1.0]}, "times: expected seconds within a scene (0 to 0.9), got -1"),
         ({"times": ["soon"]}, "times"),
         ({"times": 1.0}, "times: expected"),
         ({"times": [np.nan]}, "times[0]: expected a finite number, got nan"),
-        ({"columns": {"x": "east"}}, "east"),
-        ({"units": {"angle": "turns"}}, "turns"),
-        ({"columns": ["x"]}, "columns: expected Mapping, got list"),
-        ({"coordinates": "map"}, "coordinates: expected one of world, ego, sensor, camera, got 'map'"),
+        ({"how": TableImport(columns={"x": "east"})}, "east"),
+        ({"how": {"columns": {"x": "east"}}}, "how: expected TableImport, got dict"),
+        ({"method": "centerpoint"}, "method: expected saga or kf, centerpoint predicts nothing"),
+        ({"method": "sage"}, "method: expected one of saga, kf, centerpoint, got 'sage'"),
+        ({"like": "thin"}, "like: expected one of plain, dense, got 'thin'"),
+        ({"like": "dense", "settings": PLAIN}, "like: expected None beside settings, got 'dense'"),
     ]:
         with subtests.test(message), pytest.raises(InputError, match=re.escape(message)):
             saga_fg.predict(rows, **arguments)
-    with pytest.raises(InputError, match=re.escape("add units={'time': 'ns'}; as_given=True")):
+    with pytest.raises(InputError, match=re.escape("add how=TableImport(units={'time': 'ns'}); how=")):
         saga_fg.predict(rows.assign(timestamp=1e9 * rows.timestamp))
     none = saga_fg.predict(rows[:0], modes=True)
     assert len(none) == 0
     assert {"mode", "probability", "horizon", "cov_xx"} <= set(none.columns)
     for nothing in (saga_fg.predict(rows.assign(scene="a"), times=[]), saga_fg.track(rows[:0].assign(scene="a"))):
         assert (len(nothing), nothing.columns[0]) == (0, "scene")
-    gap = pd.concat([rows, rows.assign(timestamp=rows.timestamp + 90)])
-    late = "predict: expected times from the newest frame, at 0.9 s, to 60 s later, got 80.5 to 83"
-    with pytest.raises(InputError, match=re.escape(late)):
-        saga_fg.predict(gap, times=[80.0], settings=PLAIN)
     with pytest.raises(InputError, match="settings: expected TrackerSettings, got dict"):
         saga_fg.predict(rows, settings={"min_hits": 2})
     with pytest.raises(InputError, match=re.escape("sensors.lidar: expected Sensor, got float")):
         saga_fg.track(rows, sensors={"lidar": 0.2})
-    with pytest.raises(InputError, match=re.escape("times: expected seconds within a scene (), got 1")):
-        saga_fg.predict(rows[:0], times=[1.0])
+
+
+def test_times_from_which_nothing_is_predicted_are_left_out_and_named():
+    """As `saga-fg track --predict` leaves them out."""
+    rows = traffic(1.0)
+    gap = pd.concat([rows, rows.assign(timestamp=rows.timestamp + 90)])
+    expected = saga_fg.predict(gap, times=[0.5], settings=PLAIN)
+    left_out = "times: expected seconds within a scene (0 to 90.9), at most 60 s from a frame to a horizon; left out: "
+    with pytest.warns(UserWarning, match=re.escape(f"{left_out}-1, 80, 200")):
+        found = saga_fg.predict(gap, times=[80.0, 0.5, 200.0, -1.0], settings=PLAIN)
+    pd.testing.assert_frame_equal(found, expected)
+    with pytest.warns(UserWarning, match=re.escape("within a scene (), ")):
+        assert len(saga_fg.predict(rows[:0], times=[1.0])) == 0
