@@ -11,7 +11,9 @@ where they come within `WIDTH` m of each other. There, vehicle i is to wait for 
     cone_merge     cones close the right of two lanes; zip merging: who comes to the line first goes first
 
 Nobody enters where another one is already on the way through. A share `TAKERS` of the drivers do not wait for their
-turn. The drivers follow and halt as those of `data_tools.simulator.road` do.
+turn. Who goes in takes the right of way of j that has the better rank, or came first, could go, and comes to where
+both meet before the first one has left that, or less than `MARGIN` s after. The drivers follow and halt as those of
+`data_tools.simulator.road` do.
 """
 
 from __future__ import annotations
@@ -37,6 +39,7 @@ from data_tools.simulator.settings import SimulatorSettings, TrafficSettings, li
 from data_tools.simulator.traffic import SimulatedTrajectories, concatenated, static_objects
 from data_tools.simulator.world import scene_from_world
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, yaw_transform
+from saga_fg.tracking.right_of_way import free_time
 from saga_fg.types import Boxes, Scene
 
 Rule = Literal["all_way_stop", "priority_road", "cone_merge"]
@@ -57,6 +60,7 @@ HURRY = 2.5  # m/s^2, of those who take another's turn at a merge
 TURNING_SPEED = 6.0  # m/s
 CRITICAL_GAP = (4.0, 6.0)  # s (Highway Capacity Manual 2010, exhibit 19-10: 4.1 to 7.1)
 BOLD_GAP = 1.5  # s, that takers accept
+MARGIN = 0.5  # s after one has left, before which another one would brake for it
 TAKERS = 0.1
 ARRIVES, LOOKS = 4.0, 25.0  # m before the line, where a vehicle counts as arrived, and heeds others
 STANDING = 0.3  # m/s
@@ -157,16 +161,18 @@ def _resampled(points: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class CrossingWorld(SensedWorld):
-    """The world of a crossing; yields (T, N, N): who waits for whom; meet (N, N): whose routes do."""
+    """The world of a crossing; yields, takes (T, N, N): who waits for whom, and takes whose right of way;
+    meet (N, N): whose routes do."""
 
     yields: BoolArray
+    takes: BoolArray
     meet: BoolArray
 
 
 class CrossingTraffic:
     """Vehicles on routes under a rule, advanced by `step`."""
 
-    def __init__(self, rule: Rule, until: float, rng: np.random.Generator) -> None:
+    def __init__(self, rule: Rule, until: float, rng: np.random.Generator, takers: float = TAKERS) -> None:
         self.merging = rule == "cone_merge"
         self.routes = merge_routes() if self.merging else crossing_routes(rule == "priority_road")
         interval = INTERVALS[rule]
@@ -182,13 +188,13 @@ class CrossingTraffic:
         odds = share * (self.routes.arm == np.concatenate(arm)[:, None])
         self.route = (np.cumsum(odds / odds.sum(axis=1, keepdims=True), axis=1) > rng.random((n, 1))).argmax(axis=1)
         self.fleet: Fleet = sample_fleet(n, float(rng.uniform(9.0, 13.0)), KINDS, rng)
-        self.bold = rng.random(n) < TAKERS
+        self.bold = rng.random(n) < takers
         self.critical = rng.uniform(*CRITICAL_GAP, n)
         self.s, self.speed, self.time = np.zeros(n), 0.8 * self.fleet.drivers.desired_speed, 0.0
         self.entered, self.committed = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
         self.stood = np.full(n, rule != "all_way_stop")
         self.arrival = np.full(n, np.inf)
-        self.yields = np.zeros((n, n), dtype=np.bool_)
+        self.yields, self.takes = np.zeros((2, n, n), dtype=np.bool_)
         i, j = self.route[:, None], self.route
         routes = self.routes
         self._enter, self._leave, self._shared = (x[i, j] for x in (routes.enter, routes.leave, routes.shared))
@@ -276,13 +282,20 @@ class CrossingTraffic:
         goes = on & ~self.committed & ((to_line < 0) | (late & ~self.yields.any(axis=1) & self.stood))
         if self.merging:
             goes = on & ~self.committed & (to_line < 0)
+        leaves = free_time(self._leave - last[:, None], v[:, None])
+        comes = free_time(self._enter.T - front, v)
+        free = ~self.committed & ~(self.yields & ~self.takes.T).any(axis=1)
+        taken = goes[:, None] & open_ & (first | better) & free & (comes < leaves + MARGIN)
+        self.takes = (self.takes | taken) & open_
         self.committed |= goes
 
 
-def build_crossing(rule: Rule, seed: int, duration: float = 60.0, warm_up: float = 15.0) -> CrossingWorld:
+def build_crossing(
+    rule: Rule, seed: int, duration: float = 60.0, warm_up: float = 15.0, takers: float = TAKERS
+) -> CrossingWorld:
     """The world of a scene of `duration` s, after `warm_up` s; both count for what traffic there is."""
     rng, error = np.random.default_rng(seed).spawn(2)
-    traffic = CrossingTraffic(rule, warm_up + duration, rng)
+    traffic = CrossingTraffic(rule, warm_up + duration, rng, takers)
     for _ in range(round(warm_up / STEP)):
         traffic.step()
     columns = []
@@ -291,8 +304,8 @@ def build_crossing(rule: Rule, seed: int, duration: float = 60.0, warm_up: float
         velocity = traffic.speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         now = (traffic.time, position, velocity, heading, traffic.on_road)
         traffic.step()
-        columns.append((*now, traffic.yields))
-    time, position, velocity, heading, present, yields = (np.array(x) for x in zip(*columns, strict=True))
+        columns.append((*now, traffic.yields, traffic.takes))
+    time, position, velocity, heading, present, yields, takes = (np.array(x) for x in zip(*columns, strict=True))
     fleet = traffic.fleet
     names = np.array([f"vehicle-{k:03d}" for k in range(len(fleet))])
     yaw = np.unwrap(heading, axis=0)
@@ -301,7 +314,7 @@ def build_crossing(rule: Rule, seed: int, duration: float = 60.0, warm_up: float
     marks = static_objects(np.array([f"cone-{k:03d}" for k in range(len(cones))], dtype=np.str_), cones, time)
     pose = yaw_transform(*POST, 0.0, 0.0)
     both = concatenated([vehicles, marks])
-    return CrossingWorld(both, Boxes.empty(), lambda time: pose, (), None, yields, traffic.meet)
+    return CrossingWorld(both, Boxes.empty(), lambda time: pose, (), None, yields, takes, traffic.meet)
 
 
 def simulated_crossings(scenes: int) -> Recordings:

@@ -1,7 +1,7 @@
-"""Who yields to whom, told by the tracker against a known rule.
+"""Who yields to whom, and who takes whose right of way, told by the tracker against a known rule.
 
 Simulated vehicles go by the rule of a crossing or merge (`benchmarks.crossings`), which says at every moment
-who waits for whom; some do not wait. The tracker is given detections alone. Two measures:
+who waits for whom; a share `--takers` do not wait. The tracker is given detections alone. Two measures:
 
     pairs    of vehicles: a true one, of `SHORTEST` s or more, is found where the relation is told while it is true, and
              a told one, of `SHORTEST` s or more, is right where it is true meanwhile
@@ -35,11 +35,11 @@ from saga_fg.model import NodeTable
 from saga_fg.numerics import BoolArray, FloatArray, IntArray
 from saga_fg.tracking.edge_record import HaltingPlaces
 from saga_fg.tracking.prediction import SHARPEST_TURN, STEPS
-from saga_fg.tracking.right_of_way import INTERVAL, RightOfWay
+from saga_fg.tracking.right_of_way import INTERVAL, JOINS, RightOfWay
 from saga_fg.tracking.track_filters import MOVING, Kinematics
 from saga_fg.tracking.traffic import STEP as PATH_STEP
 from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings, paths
-from saga_fg.types import Tracks
+from saga_fg.types import RELATIONS, Tracks
 
 FITTED = 0  # first seed of scenes to which the weights are fitted
 SETTLES = 20.0  # s, in which the tracker learns the ways of traffic: not judged
@@ -48,6 +48,7 @@ NEAR = 2.0  # m from a vehicle to its track
 FIT_DURATION, FIT_SETTLES, THINNED = 120.0, 5.0, 3  # s of a scene; s not used; one pair in so many is used
 POSITION, SPEED, KEPT, YAW = 0.12, 0.15, 0.7, 0.03  # m, m/s, share of it that lasts, rad: errors of vehicles
 UNITS, DECAY = 8, 1e-5  # hidden units; weight of the squares of all weights
+JOINING_UNITS = 10, 2e-5  # of those that tell who takes the right of way
 
 RULES = ",".join(get_args(Rule))
 
@@ -56,7 +57,8 @@ Pair = tuple[int, int, int]
 
 @dataclass
 class Told:
-    """Seconds of pairs, by scene and vehicles, in which it is true, told, and both; and pairs whose routes meet."""
+    """Seconds of pairs, by scene and vehicles, in which a relation is true, told, and both; and pairs whose routes
+    meet."""
 
     true: dict[Pair, float] = field(default_factory=dict)
     told: dict[Pair, float] = field(default_factory=dict)
@@ -90,6 +92,8 @@ def right_of_way(
     *,
     rules: Annotated[str, typer.Option("--rules", help="Of crossings and merges, with commas.")] = RULES,
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Of each rule.")] = 6,
+    first: Annotated[int, typer.Option("--first", min=0, help="Seed of the first scene.")] = UNSEEN,
+    takers: Annotated[float, typer.Option("--takers", min=0, max=1, help="Share of drivers who do not wait.")] = 0.3,
     fit: Annotated[bool, typer.Option("--fit", help="Fit the weights, and print them in place of figures.")] = False,
     config: Config = None,
 ) -> Rows:
@@ -102,21 +106,23 @@ def right_of_way(
     """
     named = [cast(Rule, rule) for rule in chosen("--rules", rules, get_args(Rule))]
     if fit:
-        yield from fitted_rows(named, range(FITTED, FITTED + scenes))
+        yield from fitted_rows(named, range(FITTED, FITTED + scenes), takers)
         return
     base = load_config("traffic", config)
     for rule in named:
-        told = Told()
-        for seed in range(UNSEEN, UNSEEN + scenes):
-            judge_scene(rule, seed, base, told)
-        yield "right of way", {"rule": rule, "scenes": scenes, **told.figures()}
+        told = {name: Told() for name in RELATIONS}
+        for seed in range(first, first + scenes):
+            judge_scene(rule, seed, takers, base, told)
+        for name, one in told.items():
+            yield "right of way", {"rule": rule, "scenes": scenes, "relation": name, **one.figures()}
 
 
-def judge_scene(rule: Rule, seed: int, base: TrackConfig, found: Told) -> None:
+def judge_scene(rule: Rule, seed: int, takers: float, base: TrackConfig, found: Mapping[str, Told]) -> None:
     """Track a scene and add what is told in it."""
-    world = build_crossing(rule, seed)
+    world = build_crossing(rule, seed, takers=takers)
     scene, tracker = crossing_scene(world, seed), base.new_tracker("saga")
-    found.meeting.update((seed, int(i), int(j)) for i, j in np.argwhere(world.meet))
+    for one in found.values():
+        one.meeting.update((seed, int(i), int(j)) for i, j in np.argwhere(world.meet))
     with one_thread():
         for frame in scene.frames:
             tracks, elapsed = tracker.step(frame), frame.timestamp - float(scene.timestamps[0])
@@ -124,9 +130,11 @@ def judge_scene(rule: Rule, seed: int, base: TrackConfig, found: Told) -> None:
                 continue
             moment = min(round(elapsed / STEP), len(world.yields) - 1)
             vehicles = vehicles_of(tracks, world, moment)
-            true = {(int(i), int(j)) for i, j in np.argwhere(world.yields[moment])}
-            pairs = [(i, j) for i, j, _ in tracks.yields.rows() if i in vehicles and j in vehicles]
-            found.add(seed, true, {(vehicles[i], vehicles[j]) for i, j in pairs}, 1 / RATE)
+            rows = [row for row in tracks.relations.rows() if row[0] in vehicles and row[1] in vehicles]
+            for (name, one), here in zip(found.items(), (world.yields, world.takes), strict=True):
+                true = {(int(i), int(j)) for i, j in np.argwhere(here[moment])}
+                told = {(vehicles[i], vehicles[j]) for i, j, relation, _ in rows if relation == name}
+                one.add(seed, true, told, 1 / RATE)
 
 
 def vehicles_of(tracks: Tracks, world: CrossingWorld, moment: int) -> dict[int, int]:
@@ -139,18 +147,24 @@ def vehicles_of(tracks: Tracks, world: CrossingWorld, moment: int) -> dict[int, 
     return dict(zip(tracks.id[near].tolist(), nearest[near].tolist(), strict=True))
 
 
-def fitted_rows(rules: list[Rule], seeds: range) -> Iterator[Row]:
-    """The weights fitted to scenes: of the hidden units a row for each piece of evidence, and the constant ones."""
-    pieces = [piece for rule in rules for seed in seeds for piece in judged_pairs(rule, seed)]
-    evidence, answer = (np.concatenate(each)[::THINNED] for each in zip(*pieces, strict=True))
-    for title, weights in zip(("HIDDEN", "OUT"), fitted_weights(evidence, answer), strict=True):
-        for row in np.atleast_2d(weights):
+def fitted_rows(rules: list[Rule], seeds: range, takers: float) -> Iterator[Row]:
+    """The weights fitted to scenes: of the hidden units a row for each piece of evidence, and the constant ones.
+
+    Each relation has units of its own, the second one those of `JOINING_UNITS`, fitted where ways come together.
+    """
+    pieces = [piece for rule in rules for seed in seeds for piece in judged_pairs(rule, seed, takers)]
+    evidence, answer = (np.concatenate(each) for each in zip(*pieces, strict=True))
+    joins = evidence[:, JOINS] > 0
+    yielding, first = fitted_weights(evidence[::THINNED], answer[::THINNED, 0], UNITS, DECAY)
+    taking, second = fitted_weights(evidence[joins], answer[joins, 1], *JOINING_UNITS)
+    for title, rows in (("YIELDING", yielding), ("TAKING", taking), ("WEIGHTS", (first, second))):
+        for row in rows:
             yield title, {f"{number}": round(float(value), 2) for number, value in enumerate(row)}
 
 
-def judged_pairs(rule: Rule, seed: int) -> Iterator[tuple[FloatArray, BoolArray]]:
-    """Evidence (E, F) of pairs, and whether the first yields to the second (E,)."""
-    world, rng = build_crossing(rule, seed, FIT_DURATION), np.random.default_rng(seed)
+def judged_pairs(rule: Rule, seed: int, takers: float) -> Iterator[tuple[FloatArray, BoolArray]]:
+    """Evidence (E, F) of pairs, and whether each of `RELATIONS` is true (E, 2)."""
+    world, rng = build_crossing(rule, seed, FIT_DURATION, takers=takers), np.random.default_rng(seed)
     objects, n = world.objects, world.yields.shape[1]
     traffic, halting, known = Traffic(TrafficSettings(memory=60.0)), HaltingPlaces(), RightOfWay()
     error, has_moved = np.zeros((n, 2)), np.zeros(n)
@@ -175,23 +189,23 @@ def judged_pairs(rule: Rule, seed: int) -> Iterator[tuple[FloatArray, BoolArray]
         known, pairs, evidence = known.observed(nodes, ways, halting.lines, time)
         if pairs and time >= FIT_SETTLES:
             i, j = np.array(pairs).T
-            yield evidence, world.yields[moment, i, j]
+            yield evidence, np.column_stack([world.yields[moment, i, j], world.takes[moment, i, j]])
 
 
-def fitted_weights(evidence: FloatArray, yields: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Weights (F + 1, `UNITS`) of the hidden units and (`UNITS` + 1,) of what they say, by least logistic loss."""
+def fitted_weights(evidence: FloatArray, answer: BoolArray, units: int, decay: float) -> tuple[FloatArray, FloatArray]:
+    """Weights (F + 1, units) of the hidden units and (units + 1,) of what they say, by least logistic loss."""
     given, count = np.column_stack([evidence, np.ones(len(evidence))]), len(evidence)
-    split = given.shape[1] * UNITS
+    split = given.shape[1] * units
 
     def loss(weights: FloatArray) -> tuple[float, FloatArray]:
-        first, second = weights[:split].reshape(-1, UNITS), weights[split:]
+        first, second = weights[:split].reshape(-1, units), weights[split:]
         hidden = np.column_stack([np.tanh(given @ first), np.ones(count)])
         logits = hidden @ second
-        slope = (scipy.special.expit(logits) - yields) / count
+        slope = (scipy.special.expit(logits) - answer) / count
         back = slope[:, None] * second[:-1] * (1 - hidden[:, :-1] ** 2)
-        value = (np.logaddexp(0.0, logits) - yields * logits).mean() + DECAY / 2 * (weights**2).sum()
-        return float(value), np.concatenate([(given.T @ back).ravel(), hidden.T @ slope]) + DECAY * weights
+        value = (np.logaddexp(0.0, logits) - answer * logits).mean() + decay / 2 * (weights**2).sum()
+        return float(value), np.concatenate([(given.T @ back).ravel(), hidden.T @ slope]) + decay * weights
 
-    begin = np.random.default_rng(0).normal(0.0, 0.3, split + UNITS + 1)
+    begin = np.random.default_rng(0).normal(0.0, 0.3, split + units + 1)
     found = scipy.optimize.minimize(loss, begin, jac=True, method="L-BFGS-B", options={"maxiter": 400}).x
-    return found[:split].reshape(-1, UNITS), found[split:]
+    return found[:split].reshape(-1, units), found[split:]

@@ -36,7 +36,7 @@ def write_crossing_picture(path: Path) -> None:
     drawn = {one.name: judged_run(labelled, gaps, one, "kept") for one in (kf, saga)}
 
     def gain(gap: Gap) -> float:
-        told = drawn["saga"].holder(gap) in drawn["saga"].tracks[gap.start].yields.source
+        told = drawn["saga"].holder(gap) in drawn["saga"].tracks[gap.start].relations.source
         return told * (judgement(drawn["kf"], gap).error - judgement(drawn["saga"], gap).error)
 
     write_bytes(path, png(crossing_picture(labelled, max(gaps, key=gain), drawn)))
@@ -71,9 +71,9 @@ def _draw_yields(ax: Any, run: JudgedRun, moment: int) -> None:
     tracks, row_of = run.tracks[moment], run.row_of[moment]
     style = {"arrowstyle": "-|>", "color": YIELDS, "linewidth": 1.6, "shrinkB": 6.0}
     text = {"color": YIELDS, "fontsize": 9, "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 0.5}}
-    for source, target, probability in tracks.yields.rows():
+    for source, target, name, probability in tracks.relations.rows():
         begin, end = (tracks.boxes.position[row_of[one], :2] for one in (source, target))
-        if np.abs([begin, end]).max() < REACH:
+        if name == "yields to" and np.abs([begin, end]).max() < REACH:
             ax.annotate("", end, begin, arrowprops=style, zorder=7)
             ax.text(*(begin + 0.6 * (end - begin)), f"{probability:.2f}", zorder=8, **text)
 

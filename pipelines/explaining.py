@@ -17,7 +17,7 @@ from pipelines.tracking import OnlineTracker
 from saga_fg.errors import InputError
 from saga_fg.tracking import Event, Journal, SensorTime, of_scene
 
-PAUSE = 3.0  # s, after which one that yields to the same track again is told of anew
+PAUSE = 3.0  # s, after which a relation to the same track is told of anew
 
 
 def clock_text(name: str, clock: Mapping[str, Any], since: float | None = None) -> str:
@@ -87,16 +87,16 @@ def read_track(journal: Path, track: str, scene: str | None) -> tuple[list[Event
     if not track.isdecimal() or len(track) > 19:
         raise InputError(f"--track {track[:40]}: expected the number of a track, or SCENE-NUMBER")
     number = int(track)
-    events, clocks, told = [], [], dict[int, float]()
+    events, clocks, told = [], [], dict[tuple[int, str], float]()
     for event in read_events(journal):
         if event.get("event") == "clocks":
             clocks.append(event)
         elif event.get("track") == number and scene in (None, event.get("scene")):
             events.append(event)
-        elif event.get("event") == "yields" and events and str(event.get("scene")) == str(events[-1].get("scene")):
-            own = {other: p for source, other, p in event["yields"] if source == number}
-            new = {other: p for other, p in own.items() if event["time"] - told.get(other, -math.inf) > PAUSE}
-            events += [event | {"track": number, "other": other, "p": p} for other, p in new.items()]
+        elif event.get("event") == "relations" and events and str(event.get("scene")) == str(events[-1].get("scene")):
+            own = {(other, name): p for source, other, name, p in event["relations"] if source == number}
+            new = {one: p for one, p in own.items() if event["time"] - told.get(one, -math.inf) > PAUSE}
+            events += [event | {"track": number, "other": one, "p": p} for one, p in new.items()]
             told |= dict.fromkeys(own, event["time"])
     if not events:
         where = "" if scene is None else f" of scene {scene}"
@@ -124,13 +124,13 @@ def read_graphs(journal: Path) -> dict[str, list[Event]]:
     return _by_scene(journal, "graph")
 
 
-def read_yields(journal: Path) -> dict[str, dict[float, list[list[Any]]]]:
-    """Read who yielded to whom, by scene and time, s: rows of `Yields`; none where there is no journal.
+def read_relations(journal: Path) -> dict[str, dict[float, list[list[Any]]]]:
+    """Read right of way between tracks, by scene and time, s: rows of `Relations`; none where there is no journal.
 
     Raises `InputError` for a broken one.
     """
-    found = _by_scene(journal, "yields")
-    return {scene: {event["time"]: event["yields"] for event in events} for scene, events in found.items()}
+    found = _by_scene(journal, "relations")
+    return {scene: {event["time"]: event["relations"] for event in events} for scene, events in found.items()}
 
 
 def _by_scene(journal: Path, kind: str) -> dict[str, list[Event]]:
@@ -150,16 +150,19 @@ def read_events(journal: Path) -> Iterator[Event]:
             event = parsed_json(line, f"{journal}: line {number}")
             if not isinstance(event, dict):
                 raise InputError(f"{journal}: line {number}: expected an event, got {str(event)[:40]}")
-            if event.get("event") == "yields" and not _tells_yields(event):
-                raise InputError(f"{journal}: line {number}: expected a time, and yields [[source, target, p], ...]")
+            if event.get("event") == "relations" and not _has_relations(event):
+                wanted = "a time, and relations [[source, target, name, p], ...]"
+                raise InputError(f"{journal}: line {number}: expected {wanted}")
             yield event
 
 
-def _tells_yields(event: Event) -> bool:
-    rows = event.get("yields")
-    if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != 3 for row in rows):
+def _has_relations(event: Event) -> bool:
+    rows = event.get("relations")
+    if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != 4 for row in rows):
         return False
-    numbers = [event.get("time"), *(value for row in rows for value in row)]
+    if not all(isinstance(row[2], str) for row in rows):
+        return False
+    numbers = [event.get("time"), *(row[k] for row in rows for k in (0, 1, 3))]
     return all(isinstance(value, int | float) and math.isfinite(value) for value in numbers)
 
 
@@ -181,7 +184,7 @@ def _story(events: Sequence[Event]) -> list[str]:
         "missed": _missed,
         "deleted": _deleted,
         "unsettled": _unsettled,
-        "yields": _yields,
+        "relations": _relation,
     }
     lines = [head]
     for event in events:
@@ -230,8 +233,9 @@ def _unsettled(event: Event) -> list[str]:
     return [f"not settled: the solver found no minimum of the graph; known to {deviation} m, no better than predicted"]
 
 
-def _yields(event: Event) -> list[str]:
-    return [f"yields to track {event['other']}, probability {event['p']:.2f}"]
+def _relation(event: Event) -> list[str]:
+    other, name = event["other"]
+    return [f"{name} track {other}, probability {event['p']:.2f}"]
 
 
 def _split(candidates: Sequence[Event]) -> tuple[Event, list[Event]]:

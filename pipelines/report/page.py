@@ -29,7 +29,7 @@ from data_tools.datasets.source import DatasetSource
 from data_tools.figures import COLOURS, Chart, FigureTable, as_json, class_colours
 from data_tools.files import parsed_json, read_bytes, write_text
 from pipelines.config import load_config
-from pipelines.explaining import clock_table, journal_of, read_yields
+from pipelines.explaining import clock_table, journal_of, read_relations
 from pipelines.report.figures import UNSEEN, latency_chart, track_charts, track_figures
 from pipelines.report.scenes import ReportScene, comparisons, scene_data, start_thresholds, thumbnails
 from saga_fg.errors import InputError
@@ -169,14 +169,14 @@ def as_recorded(source: DatasetSource, result: Path) -> DatasetSource:
 class _Result:
     """A result that has been read: of a method, by scene, with the record of its run where there is one.
 
-    yields  who yielded to whom, by scene and time, s: of its journal, for pages
+    relations  right of way between tracks, by scene and time, s: of its journal, for pages
     """
 
     method: str
     path: Path
     found: Results
     record: RunRecord | None
-    yields: Mapping[str, Mapping[float, Sequence[Sequence[Any]]]] = field(default_factory=dict)
+    relations: Mapping[str, Mapping[float, Sequence[Sequence[Any]]]] = field(default_factory=dict)
 
 
 def result_report(source: DatasetSource, result: Path, beside: Path | None = None, images: int = 0) -> Report:
@@ -235,8 +235,8 @@ def result_scenes(source: DatasetSource, result: Path, found: Results) -> list[R
 
 def _read(source: DatasetSource, path: Path) -> _Result:
     record = read_run_record(path)
-    method, yields = path.stem if record is None else record.method, read_yields(journal_of(path))
-    return _Result(method, path, source.read_results(path), record, yields)
+    method, relations = path.stem if record is None else record.method, read_relations(journal_of(path))
+    return _Result(method, path, source.read_results(path), record, relations)
 
 
 def _with_distinct_names(one: _Result, other: _Result) -> list[_Result]:
@@ -258,7 +258,7 @@ def _scenes(source: DatasetSource, result: _Result) -> list[ReportScene]:
             config.tracker.edges,
             config.sensors,
             {result.method: predicted[name]} if name in predicted else {},
-            yields={result.method: result.yields.get(name, {})},
+            relations={result.method: result.relations.get(name, {})},
         )
         for name, each in result.found.scenes.items()
     ]
@@ -285,7 +285,7 @@ def _joined(scene: ReportScene, result: _Result, other: ReportScene | None) -> R
         tracks={**other.tracks, **scene.tracks},
         coasting={**other.coasting, **scene.coasting},
         predictions={**other.predictions, **scene.predictions},
-        yields={**other.yields, **scene.yields},
+        relations={**other.relations, **scene.relations},
     )
 
 

@@ -49,7 +49,7 @@ from pipelines.tracking import TrackedScene
 from saga_fg import Boxes, ConstantVelocity, Frame, NodeType, Scene, Sensor
 from saga_fg.model import EdgeRule, NodeTable, sensor_model
 from saga_fg.numerics import FloatArray, IntArray, StrArray, yaw_of
-from saga_fg.types import COLOUR_LABELS, MAX_LIGHT_DISTANCE, Annotations, Lane, StopLine, TrafficLight
+from saga_fg.types import COLOUR_LABELS, MAX_LIGHT_DISTANCE, RELATIONS, Annotations, Lane, StopLine, TrafficLight
 
 Thumbnails = Mapping[str, list[str | None]]
 QUALITY = 60  # of JPEG, in percent
@@ -163,7 +163,7 @@ class ReportScene:
     sensors   models by name, which place detections in the world
     predictions  by the tracker's name, of its tracks; may be left out
     map       of the place; cameras: thumbnails of images for each moment, by camera
-    yields    by the tracker's name, rows of `saga_fg.types.Yields` by time, s; may be left out
+    relations  by the tracker's name, rows of `saga_fg.types.Relations` by time, s; may be left out
     """
 
     scene: Scene
@@ -174,7 +174,7 @@ class ReportScene:
     predictions: Mapping[str, PredictionRows] = field(default_factory=dict)
     map: AreaMap | None = None
     cameras: Thumbnails = field(default_factory=dict)
-    yields: Mapping[str, Mapping[float, Sequence[Sequence[Any]]]] = field(default_factory=dict)
+    relations: Mapping[str, Mapping[float, Sequence[Sequence[Any]]]] = field(default_factory=dict)
 
 
 def scene_of_run(
@@ -188,7 +188,7 @@ def scene_of_run(
         rules,
         sensors,
         {name: PredictionRows.from_moments(run.predictions) for name, run in runs.items() if run.predictions},
-        yields={name: {each.timestamp: each.yields.rows() for each in run.tracks} for name, run in runs.items()},
+        relations={name: {each.timestamp: each.relations.rows() for each in run.tracks} for name, run in runs.items()},
     )
 
 
@@ -214,7 +214,13 @@ def scene_data(report: ReportScene) -> dict[str, Any]:
         "labels": labels.tolist(),
         "methods": {
             name: _method(
-                table, coasting.get(name), labels, origin, scene.timestamps, report.rules, report.yields.get(name, {})
+                table,
+                coasting.get(name),
+                labels,
+                origin,
+                scene.timestamps,
+                report.rules,
+                report.relations.get(name, {}),
             )
             | predictions_data(report.predictions.get(name), table, scene.timestamps, origin)
             for name, table in report.tracks.items()
@@ -242,7 +248,7 @@ def _method(
     origin: FloatArray,
     times: FloatArray,
     rules: Sequence[EdgeRule],
-    yields: Mapping[float, Sequence[Sequence[Any]]],
+    relations: Mapping[float, Sequence[Sequence[Any]]],
 ) -> dict[str, Any]:
     ids, number = np.unique(table.id, return_inverse=True)
     covariance = table.position_covariance
@@ -257,28 +263,31 @@ def _method(
     rows = _whole(np.column_stack(columns))
     starts = np.searchsorted(table.frame, np.arange(len(times) + 1)).tolist()
     edges = edges_of_frames(table, len(times), rules)
-    waiting = yields_data(yields, ids.tolist(), times, len(rules))
+    others = relations_data(relations, ids.tolist(), times, len(rules))
     return {
         "ids": ids.tolist(),
         "moments": [rows[a:b] for a, b in pairwise(starts)],
         "edges": [
             _whole(np.column_stack([number[target], number[source], 1000 * rate, rule])) + more
-            for (target, source, rate, rule), more in zip(edges, waiting, strict=True)
+            for (target, source, rate, rule), more in zip(edges, others, strict=True)
         ],
-        "relations": [*relation_names(rules), "yields to"],
+        "relations": [*relation_names(rules), *RELATIONS],
     }
 
 
-def yields_data(
-    found: Mapping[float, Sequence[Sequence[Any]]], ids: Sequence[str], times: FloatArray, relation: int
+def relations_data(
+    found: Mapping[float, Sequence[Sequence[Any]]], ids: Sequence[str], times: FloatArray, rules: int
 ) -> list[Rows]:
-    """Return at each moment which of the tracks yield to which, as edges of the kind `relation`."""
+    """Return the relations of tracks at each moment as edges, of kinds that follow those of the `rules`."""
+    kind = {name: rules + k for k, name in enumerate(RELATIONS)}
     number = _numbers(ids)
     moments: list[Rows] = [[] for _ in times]
     for time, rows in found.items():
         k = int(np.searchsorted(times, time - _SAME_TIME))
         if k < len(times) and times[k] < time + _SAME_TIME:
-            known = ((number.get(str(a)), number.get(str(b)), round(1000 * p), relation) for a, b, p in rows)
+            known = (
+                (number.get(str(a)), number.get(str(b)), round(1000 * p), kind.get(name)) for a, b, name, p in rows
+            )
             moments[k] = [list(row) for row in known if None not in row]
     return moments
 

@@ -174,7 +174,7 @@ def parse_message(line: bytes, settings: StreamSettings) -> FrameMessage | Reque
 def tracks_message(tracks: Tracks) -> dict[str, Any]:
     """Return the answer to a frame: the tracks in world coordinates, with the columns of track files.
 
-    `settled` is there where it is false alone, `yields` where there are any.
+    `settled` is there where it is false alone, `relations` where there are any.
     """
     boxes, covariance = tracks.boxes, tracks.position_covariance
     numbers = np.column_stack(
@@ -191,8 +191,9 @@ def tracks_message(tracks: Tracks) -> dict[str, Any]:
     for row in np.flatnonzero(~tracks.settled).tolist():
         rows[row]["settled"] = False
     message = {"type": "tracks", "timestamp": tracks.timestamp, "tracks": rows}
-    yields = [{"source": a, "target": b, "probability": p} for a, b, p in tracks.yields.rows()]
-    return message | ({"yields": yields} if yields else {})
+    columns = ("source", "target", "relation", "probability")
+    relations = [dict(zip(columns, row, strict=True)) for row in tracks.relations.rows()]
+    return message | ({"relations": relations} if relations else {})
 
 
 def predictions_message(predicted: PredictedTracks) -> dict[str, Any]:

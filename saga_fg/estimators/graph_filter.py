@@ -290,10 +290,6 @@ class GraphFilter(Estimator):
         """
         return self._whole().smoothed(self._layout, self.start)
 
-    def smoothed_means(self) -> tuple[tuple[float, StateLayout, FloatArray], ...]:
-        """Time, s, layout and mean of every state of `smoothed`, whose covariances cost an elimination each."""
-        return tuple((time, layout, mean) for time, layout, _, mean in self._whole().epochs(self._layout, self.start))
-
     def _whole(self) -> WholeGraph:
         return whole_graph(self._smoother.graph(), self._independent, self._window, self._labels)
 

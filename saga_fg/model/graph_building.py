@@ -283,9 +283,14 @@ def joint_generator(graph: SceneGraph) -> tuple[FloatArray, FloatArray, FloatArr
 
 def _acting_together(rules: Mapping[int, MovingRule]) -> list[tuple[int, ...]]:
     """Sets of rules, by number, that may act on one object: of some class, which was seen moving or was not."""
+    of_moving = {
+        k
+        for k, rule in rules.items()
+        if isinstance(rule, Neighbours | Following) and not getattr(rule, "parked", False)
+    }
     classes = {label for rule in rules.values() for label in _classes(rule)}
     found = {
-        tuple(k for k, rule in rules.items() if label in _classes(rule) and (moved in _states(rule)))
+        tuple(k for k, rule in rules.items() if label in _classes(rule) and (moved or k not in of_moving))
         for label in sorted(classes)
         for moved in (True, False)
     }
@@ -294,17 +299,6 @@ def _acting_together(rules: Mapping[int, MovingRule]) -> list[tuple[int, ...]]:
 
 def _classes(rule: MovingRule) -> tuple[str, ...]:
     return (*rule.attached, *rule.carriers) if isinstance(rule, Attached) else rule.classes
-
-
-def _states(rule: MovingRule) -> tuple[bool, ...]:
-    """States of objects that a rule acts on: True for seen moving, False for others."""
-    match rule:
-        case Neighbours():
-            return (True,)
-        case Following():
-            return (True, False) if rule.parked else (True,)
-        case _:
-            return (True, False)
 
 
 def _pairs_of_nodes(rules: Sequence[MovingRule], turns: FloatArray) -> tuple[SceneGraph, float]:

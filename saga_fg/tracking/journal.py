@@ -12,7 +12,7 @@ A journal of a tracker: an event for every track and frame with the reasons, as 
     deleted    time without a detection, existence, and the limit that was passed
     clocks     offsets of the sensors' clocks, whenever one is corrected anew, or its frames are left out or used again
     graph      running graph of the interval that the frame ended, once a frame
-    yields     who yields to whom: rows of `saga_fg.types.track.Yields`, where there are any
+    relations  right of way: rows of `saga_fg.types.track.Relations`, where there are any
 
 `matched` and `missed` also list the edges that acted on the prediction, and the effect of each. Positions are in world
 coordinates.
@@ -71,7 +71,7 @@ class TrackerView:
     clock, shared of the sensors, and what their frames have in common, see `clocks`
     settled       (n,) tracks for which the solver has found the minimum of the graph
     running       the running graph, where factor providers take part; its positions are local
-    yields        rows of `saga_fg.types.track.Yields`
+    relations     rows of `saga_fg.types.track.Relations`
     """
 
     timestamp: float
@@ -89,7 +89,7 @@ class TrackerView:
     shared: SharedObservations
     settled: BoolArray
     running: SceneFactorGraph | None
-    yields: list[tuple[int, int, float]]
+    relations: list[tuple[int, int, str, float]]
 
     @classmethod
     def from_state(
@@ -119,7 +119,7 @@ class TrackerView:
             shared=state.shared,
             settled=state.joint.settled(table.id),
             running=state.joint.estimator.graph() if state.providers else None,
-            yields=state.right_of_way.yields(table.id).rows(),
+            relations=state.right_of_way.relations(table.id).rows(),
         )
 
     @property
@@ -288,7 +288,7 @@ class Journal:
         self._effects: list[EdgeEffect] = []
         self._start: float | None = None
         self._clocks: dict[str, tuple[float, str]] = {}
-        self._yielding = False
+        self._related = False
 
     def after(self, stage: Stage, view: Callable[[], TrackerView]) -> None:
         """Take note of a stage."""
@@ -313,10 +313,10 @@ class Journal:
             assert self._before is not None
             self._write_ends(self._before, now, partial(self._reason, self._before))
             self._write_clocks(now)
-            if now.yields or self._yielding:
-                self._yielding = bool(now.yields)
-                event = {"event": "yields", "time": now.timestamp, "sensor": now.sensor}
-                self._write(event | {"yields": now.yields})
+            if now.relations or self._related:
+                self._related = bool(now.relations)
+                event = {"event": "relations", "time": now.timestamp, "sensor": now.sensor}
+                self._write(event | {"relations": now.relations})
             self._before = now
 
     def _write_clocks(self, now: TrackerView) -> None:

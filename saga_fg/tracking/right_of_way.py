@@ -1,4 +1,4 @@
-"""Right of way: who waits for whom where paths cross or come together.
+"""Right of way: who waits for whom where paths cross or come together, and who goes though it should wait.
 
 Vehicles in view go on along their paths (`saga_fg.tracking.prediction`), which follow the trails of earlier traffic and
 the lanes of the map. Two meet where a point of one path is within `NEAR` m of the other path, at its first such point,
@@ -7,15 +7,17 @@ before that point (`saga_fg.tracking.edge_record`), else `CROSSING` or `JOINING`
 `ARRIVES` m before this line.
 
 For each ordered pair i, j the evidence e (`_evidence`) holds distances, speeds, times, who leads, where traffic halts
-and the order of arrival. The probability that i yields to j is
+and the order of arrival. One model tells two relations, as both rest on who should go first, and who does: i yields to
+j; or i takes the right of way of j, where i should wait and goes, and j brakes or would have to. Their probabilities:
 
-    p = 1 / ( 1 + exp(-z) ),   z = w tanh(V [e, 1]) + w_0
+    p = 1 / ( 1 + exp(-z) ),   z = W tanh(V [e, 1]) + w_0
 
-smoothed over `SMOOTHING` s. V, w are fitted to simulated crossings and merges of known rules, by
+smoothed over `SMOOTHING` s. V, W are fitted to simulated crossings and merges of known rules, by
 `python -m benchmarks right-of-way --fit`.
 
 Vehicles that are not detected are judged by where they are predicted. Such a vehicle waits with the probability P, the
-largest of its p, and its acceleration along its path is the mean of both, d m before its line and a where it goes on:
+largest with which it yields, and its acceleration along its path is the mean of both, d m before its line and a where
+it goes on:
 
     a' = (1 - P) a - P min( v^2 / (2 d), `HARDEST` )
 """
@@ -35,10 +37,10 @@ from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.tracking.edge_record import Lines
 from saga_fg.tracking.right_of_way_weights import HIDDEN, OUT
 from saga_fg.tracking.traffic import STEP as PATH_STEP
-from saga_fg.types import Yields
+from saga_fg.types import RELATIONS, Relations
 
 INTERVAL = 0.2  # s between two judgements
-LEAST = 0.7  # probability from which it is told that one yields
+LEAST = (0.7, 0.5)  # probability from which each of `RELATIONS` is told
 SMOOTHING = 0.3  # s, of probabilities
 SPEED_SMOOTHING = 0.5  # s, of changes of speed
 SPACING, BEHIND = 1.0, 5  # m between points of a path, and how many of them are behind the vehicle's middle
@@ -51,6 +53,8 @@ AT_LINE, PASSED, HARDEST = 0.3, 1.0, 4.0  # m before and beyond a line, where ve
 GOES, CRUISE, SLOW = 1.8, 10.0, 2.0  # m/s^2 and m/s of a vehicle that goes on freely; m/s
 
 Pair = tuple[int, int]
+YIELDS, TAKES = 0, 1  # among `RELATIONS`
+JOINS = 22  # column of evidence: 1 where the ways come together, 0 where they cross
 
 
 class Meetings(NamedTuple):
@@ -69,14 +73,14 @@ class RightOfWay:
     time         of the latest judgement, s
     motion       speed, m/s, and acceleration, m/s^2, of vehicles, by id
     arrived      when they have arrived, s, by id
-    probability  that the first of two yields to the second, by ids
+    probability  of each of `RELATIONS` from the first to the second, by ids
     line         place (2,), local, m, at which the first would wait for the second, by ids of those whose paths cross
     """
 
     time: float = -math.inf
     motion: Mapping[int, tuple[float, float]] = field(default_factory=dict)
     arrived: Mapping[int, float] = field(default_factory=dict)
-    probability: Mapping[Pair, float] = field(default_factory=dict)
+    probability: Mapping[Pair, tuple[float, ...]] = field(default_factory=dict)
     line: Mapping[Pair, FloatArray] = field(default_factory=dict)
 
     def due(self, time: float) -> bool:
@@ -96,7 +100,7 @@ class RightOfWay:
         """Vehicles that may wait, by id: the probability, and the place (2,) of the line."""
         found = dict[int, tuple[float, FloatArray]]()
         for pair, place in self.line.items():
-            if (p := self.probability.get(pair, 0.0)) > found.get(pair[0], (0.0,))[0]:
+            if (p := self.probability.get(pair, (0.0,))[YIELDS]) > found.get(pair[0], (0.0,))[0]:
                 found[pair[0]] = p, place
         return found
 
@@ -113,18 +117,24 @@ class RightOfWay:
         found[rows] = (1 - share) * free[rows] - share * np.minimum(braking, HARDEST)
         return found
 
-    def yields(self, ids: IntArray) -> Yields:
-        """Who yields to whom, among the tracks `ids` (n,)."""
-        return Yields.of_pairs({pair: p for pair, p in self.probability.items() if p >= LEAST}).between(ids)
+    def relations(self, ids: IntArray) -> Relations:
+        """What is told of the tracks `ids` (n,)."""
+        told = [
+            (*pair, name, p)
+            for pair, each in self.probability.items()
+            for name, p, least in zip(RELATIONS, each, LEAST, strict=True)
+            if p >= least
+        ]
+        return Relations.of_rows(told).between(ids)
 
     def later(self, nodes: NodeTable, paths: Paths, lines: Lines, time: float) -> Self:
         """After a judgement of the vehicles that have `paths`; see `observed`."""
         known, pairs, found = self.observed(nodes, paths, lines, time)
         kept = math.exp((self.time - time) / SMOOTHING)
-        now = yielding(found)
+        now = dict(zip(pairs, map(tuple, probabilities(found).tolist()), strict=True))
         smoothed = {
-            pair: p if (before := self.probability.get(pair)) is None else kept * before + (1 - kept) * p
-            for pair, p in zip(pairs, now.tolist(), strict=True)
+            pair: tuple(kept * a + (1 - kept) * p for a, p in zip(self.probability.get(pair, each), each, strict=True))
+            for pair, each in now.items()
         }
         return replace(known, probability=smoothed)
 
@@ -171,10 +181,12 @@ class RightOfWay:
         }
 
 
-def yielding(evidence: FloatArray) -> FloatArray:
-    """The probability (E,) that the first of each pair yields to the second, by the evidence (E, F)."""
+def probabilities(evidence: FloatArray) -> FloatArray:
+    """The probability (E, 2) of each of `RELATIONS` from the first of each pair to the second, by evidence (E, F)."""
     hidden = np.tanh(evidence @ HIDDEN[:-1] + HIDDEN[-1])
-    return np.asarray(expit(hidden @ OUT[:-1] + OUT[-1]))
+    found = expit(hidden @ OUT[:-1] + OUT[-1])
+    found[:, TAKES] = np.where(evidence[:, JOINS] > 0, found[:, TAKES], 0.0)
+    return np.asarray(found)
 
 
 def free_time(distance: FloatArray, speed: FloatArray) -> FloatArray:

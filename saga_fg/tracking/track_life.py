@@ -242,8 +242,8 @@ def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
     columns = {"id": table.id[rows], "score": score, "coasting": coasting}
     columns["settled"] = state.joint.settled(columns["id"])
     covariances = {"position_covariance": P, "velocity_covariance": now.P_velocity}
-    yields = state.right_of_way.yields(columns["id"])
-    return unchecked(Tracks, timestamp=timestamp, boxes=boxes, yields=yields, **_frozen(columns | covariances))
+    relations = state.right_of_way.relations(columns["id"])
+    return unchecked(Tracks, timestamp=timestamp, boxes=boxes, relations=relations, **_frozen(columns | covariances))
 
 
 def _frozen(columns: dict[str, Any]) -> dict[str, Any]:

@@ -57,7 +57,7 @@ class TrackerSnapshot:
     graph         scene graph of the latest interval, None before the first
     edge_record   how well edges have predicted
     halting       where vehicles halt with nobody before them
-    right_of_way  who yields to whom
+    right_of_way  who yields to whom, and who goes though it should wait
     encounters    pairs of tracks that may have exchanged their objects
     start         time from which all others in here are counted, s
     time          of the state, s

@@ -115,35 +115,43 @@ class Track:
     settled: bool = True
 
 
-@dataclass(frozen=True, eq=False)
-class Yields:
-    """R pairs of tracks of one moment, of which one yields to the other where their paths meet.
+RELATIONS = ("yields to", "takes the right of way of")
 
-    source, target  (R,) ids: `source` waits for `target`, or is about to
+
+@dataclass(frozen=True, eq=False)
+class Relations:
+    """R relations between two tracks of one moment whose paths meet.
+
+    source, target  (R,) ids
+    name            (R,) of `RELATIONS`. yields to: `source` waits for `target`, or is about to; takes the right of way
+                    of: `source` goes where it should wait for `target`, which brakes or would have to
     probability     (R,) from 0 to 1
     """
 
     source: IntArray
     target: IntArray
+    name: StrArray
     probability: FloatArray
 
     @classmethod
-    def of_pairs(cls, pairs: Mapping[tuple[int, int], float]) -> Self:
-        """From the probability of each pair of ids."""
-        ids = np.array(list(pairs), dtype=np.int64).reshape(-1, 2)
-        return cls(ids[:, 0], ids[:, 1], np.array(list(pairs.values()), dtype=np.float64))
+    def of_rows(cls, rows: Sequence[tuple[int, int, str, float]]) -> Self:
+        """From source, target, name and probability of each."""
+        source, target, name, probability = zip(*rows, strict=True) if rows else ((),) * 4
+        first, second = (np.array(each, dtype=np.int64) for each in (source, target))
+        return cls(first, second, np.array(name, dtype=np.str_), np.array(probability, dtype=np.float64))
 
     def __len__(self) -> int:
         return len(self.source)
 
     def between(self, ids: IntArray) -> Self:
-        """Select the pairs whose tracks are both among the `ids` (n,)."""
+        """Select those whose tracks are both among the `ids` (n,)."""
         kept = np.isin(self.source, ids) & np.isin(self.target, ids)
-        return type(self)(self.source[kept], self.target[kept], self.probability[kept])
+        return type(self)(self.source[kept], self.target[kept], self.name[kept], self.probability[kept])
 
-    def rows(self) -> list[tuple[int, int, float]]:
-        """Source, target and probability of each, as plain values."""
-        return list(zip(self.source.tolist(), self.target.tolist(), self.probability.tolist(), strict=True))
+    def rows(self) -> list[tuple[int, int, str, float]]:
+        """Source, target, name and probability of each, as plain values."""
+        columns = (self.source, self.target, self.name, self.probability)
+        return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +167,7 @@ class Tracks(Columns, ShownTable):
     coasting             (N,)       seconds since the last detection, 0 when just updated
     settled              (N,)       False where the solver found no minimum of a nonlinear graph: the covariance is then
                                     not smaller than the predicted one; True for all if left out
-    yields                          who yields to whom; none if left out
+    relations                       right of way between them; none if left out
     """
 
     timestamp: float
@@ -170,12 +178,12 @@ class Tracks(Columns, ShownTable):
     velocity_covariance: FloatArray
     coasting: FloatArray
     settled: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
-    yields: Yields = field(default_factory=lambda: Yields.of_pairs({}))
+    relations: Relations = field(default_factory=lambda: Relations.of_rows([]))
 
     def _rows(self, rows: Any) -> Self:
-        """Some tracks, and who of them yields to whom."""
+        """Some tracks, and the relations between them."""
         chosen = super()._rows(rows)
-        vars(chosen)["yields"] = self.yields.between(chosen.id)
+        vars(chosen)["relations"] = self.relations.between(chosen.id)
         return chosen
 
     def __post_init__(self) -> None:

@@ -5,8 +5,10 @@ from functools import cache
 import numpy as np
 import pytest
 
+from benchmarks import right_of_way
 from benchmarks.crossings import CrossingWorld, Rule, build_crossing, crossing_scene
-from benchmarks.right_of_way import Told
+from benchmarks.right_of_way import Told, judged_pairs
+from saga_fg.tracking.right_of_way import JOINS, probabilities
 
 RULES: tuple[Rule, ...] = ("all_way_stop", "priority_road", "cone_merge")
 
@@ -25,6 +27,7 @@ def test_vehicles_under_a_rule_wait_and_do_not_collide(rule):
     away[:, np.arange(n), np.arange(n)] = np.inf
     assert np.nanmin(away) > 1.5
     assert here.yields.any()
+    assert not (here.takes & ~here.meet).any()
     assert not (here.yields & ~here.meet).any()
     assert not here.yields[:, np.arange(n), np.arange(n)].any()
     cones = here.objects.label == "traffic_cone"
@@ -49,6 +52,16 @@ def test_a_crossing_is_the_same_for_the_same_seed():
     assert len(one.frames) == 20
     for a, b in zip(one.frames, other.frames, strict=True):
         assert np.array_equal(a.detections.boxes.position, b.detections.boxes.position)
+
+
+def test_who_takes_the_right_of_way_is_told_where_ways_come_together(monkeypatch):
+    monkeypatch.setattr(right_of_way, "FIT_DURATION", 50.0)
+    evidence, answer = (np.concatenate(each) for each in zip(*judged_pairs("cone_merge", 1003, 0.5), strict=True))
+    p, takes = probabilities(evidence)[:, 1], answer[:, 1]
+    assert takes.any()
+    assert p[takes].mean() > 0.2
+    assert p[takes].mean() > 20 * p[~takes].mean()
+    assert (p[evidence[:, JOINS] == 0] == 0).all()
 
 
 def test_figures_of_pairs_and_moments():

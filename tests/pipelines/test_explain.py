@@ -10,13 +10,13 @@ import pytest
 from data_tools.datasets.detection_files import PREDICTION_COLUMNS, PredictionRows, predictions_path, read_predictions
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.config import load_config
-from pipelines.explaining import journal_of, read_track, read_yields, story
+from pipelines.explaining import journal_of, read_relations, read_track, story
 from pipelines.report import Report, report_page, scene_of_run
-from pipelines.report.scenes import scene_data, yields_data
+from pipelines.report.scenes import relations_data, scene_data
 from pipelines.serving.messages import tracks_message
 from pipelines.tracking import TrackedScene, track_scene
 from saga_fg import InputError, Tracks
-from saga_fg.types import Yields
+from saga_fg.types import RELATIONS, Relations
 from tests.pipelines.command import done, refused, saga_fg
 from tests.pipelines.page_in_browser import tried_in_browser
 
@@ -72,8 +72,9 @@ def test_journals_that_are_not_there_or_broken(tmp_path):
     for content, expected in (
         ("{\n", "line 1: broken or truncated JSON"),
         ("3\n", "line 1: expected an event"),
-        ('{"event": "yields"}\n', "line 1: expected a time, and yields"),
-        ('{"event": "yields", "time": 1.0, "yields": [[1, 2]]}\n', "line 1: expected a time, and yields"),
+        ('{"event": "relations"}\n', "line 1: expected a time, and relations"),
+        ('{"event": "relations", "time": 1.0, "relations": [[1, 2]]}\n', "line 1: expected a time, and relations"),
+        ('{"event": "relations", "time": 1, "relations": [[1, 2, 3, 1]]}\n', "line 1: expected a time, and relations"),
     ):
         (tmp_path / "tracks.json.journal.jsonl").write_text(content)
         assert expected in refused("explain", tmp_path / "tracks.json", "--track", "1")
@@ -96,25 +97,31 @@ def test_an_event_that_nobody_wrote(folder, tmp_path):
         assert result.stdout == ""
 
 
-def test_who_yields_is_told_in_answers_stories_and_pages(tmp_path):
-    tracks = replace(Tracks.empty(3.0), yields=Yields.of_pairs({(1, 2): 0.75}))
-    assert tracks_message(tracks)["yields"] == [{"source": 1, "target": 2, "probability": 0.75}]
-    assert "yields" not in tracks_message(Tracks.empty(3.0))
+YIELDS, TAKES = RELATIONS
+
+
+def test_right_of_way_is_told_in_answers_stories_and_pages(tmp_path):
+    tracks = replace(Tracks.empty(3.0), relations=Relations.of_rows([(1, 2, YIELDS, 0.75)]))
+    told = {"source": 1, "target": 2, "relation": "yields to", "probability": 0.75}
+    assert tracks_message(tracks)["relations"] == [told]
+    assert "relations" not in tracks_message(Tracks.empty(3.0))
     journal = journal_of(tmp_path / "t.csv")
     about = {"scene": "a", "sensor": "lidar", "track": 1, "label": "car"}
     initiated = about | {"event": "initiated", "time": 0.0, "detection": 0, "probability": 0.9}
     initiated |= {"least_probability": 0.1, "nearest_tracks": [], "gate": 9.0}
-    told = {"scene": "a", "event": "yields", "sensor": "lidar"}
-    moments = ([[1, 2, 0.75]], [[1, 2, 0.8]], [])
-    events = [initiated, *(told | {"time": 0.1 * k, "yields": rows} for k, rows in enumerate(moments, 1))]
+    told = {"scene": "a", "event": "relations", "sensor": "lidar"}
+    moments = ([[1, 2, YIELDS, 0.75]], [[1, 2, YIELDS, 0.8], [1, 2, TAKES, 0.9]], [])
+    events = [initiated, *(told | {"time": 0.1 * k, "relations": rows} for k, rows in enumerate(moments, 1))]
     journal.write_text("\n".join(map(json.dumps, events)))
     lines = story(read_track(journal, "1", None)[0])
-    assert [line.split("lidar")[1].strip() for line in lines if "yields" in line] == [
-        "yields to track 2, probability 0.75"
+    assert [line.split("lidar")[1].strip() for line in lines if "track 2" in line] == [
+        "yields to track 2, probability 0.75",
+        "takes the right of way of track 2, probability 0.90",
     ]
-    assert read_yields(journal)["a"][0.1] == [[1, 2, 0.75]]
-    shown = yields_data(read_yields(journal)["a"] | {0.5: [[1, 9, 0.7]]}, ["1", "2"], np.array([0.1, 0.5]), 3)
-    assert shown == [[[0, 1, 750, 3]], []]  # nobody has the number 9
+    assert read_relations(journal)["a"][0.1] == [[1, 2, YIELDS, 0.75]]
+    others = {0.5: [[1, 9, YIELDS, 0.7], [2, 1, TAKES, 0.6], [1, 2, "admires", 0.6]]}
+    shown = relations_data(read_relations(journal)["a"] | others, ["1", "2"], np.array([0.1, 0.5]), 3)
+    assert shown == [[[0, 1, 750, 3]], [[1, 0, 600, 4]]]  # nobody has the number 9
 
 
 def test_what_keeps_no_journal(folder, tmp_path):

@@ -244,9 +244,9 @@ def test_two_results_stand_side_by_side(folder):
     assert {"saga: Tracks at a time", "kf: Tracks at a time"} <= {chart["title"] for chart in data["charts"]}
 
 
-def test_who_yields_is_shown_of_both_results(folder):
+def test_right_of_way_is_shown_of_both_results(folder):
     for method, p in (("saga", 0.75), ("kf", 0.85)):
-        event = {"event": "yields", "scene": "d", "time": 1.0, "yields": [[1, 2, p]]}
+        event = {"event": "relations", "scene": "d", "time": 1.0, "relations": [[1, 2, "yields to", p]]}
         (folder / f"{method}.csv.journal.jsonl").write_text(json.dumps(event))
     assert report(folder, "--beside", folder / "kf.csv").exit_code == 0
     methods = data_of((folder / "page.html").read_text(encoding="utf-8"))["scenes"][0]["methods"]

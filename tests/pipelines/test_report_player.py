@@ -382,7 +382,7 @@ def test_relations_have_the_names_of_their_rules(tmp_path):
 
     report = crowded(["car", "car"])
     data = scene_data(replace(report, rules=(Following(), Admires())))["methods"]["saga"]
-    assert data["relations"] == ["follows", "Admires", "yields to"]
+    assert data["relations"] == ["follows", "Admires", "yields to", "takes the right of way of"]
     assert [0, 1, 400, 1] in data["edges"][3]
     page = report_page(Report("relations", [], [replace(report, rules=(Admires(),))]))
     script = """

@@ -9,10 +9,10 @@ from saga_fg import Boxes, Detections, Frame, Tracker, TrackerSettings
 from saga_fg.kernels.paths import path_meetings
 from saga_fg.model import NodeTable
 from saga_fg.tracking.edge_record import Lines
-from saga_fg.tracking.right_of_way import RightOfWay, free_time, yielding
+from saga_fg.tracking.right_of_way import RightOfWay, free_time, probabilities
 from saga_fg.tracking.table_tracking import dense_traffic_settings
 from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings, paths
-from saga_fg.types import RoadMap, StopLine, TrafficLight
+from saga_fg.types import RELATIONS, RoadMap, StopLine, TrafficLight
 
 EAST, NORTH = 0.0, np.pi / 2
 NOBODY_HALTS = Lines.none()
@@ -61,8 +61,8 @@ def judged(moments, traffic=CROSSING, lines=NOBODY_HALTS):
     return known
 
 
-def told(known):
-    return {(a, b) for a, b, _ in known.yields(np.arange(1, 10)).rows()}
+def told(known, name=RELATIONS[0]):
+    return {(a, b) for a, b, relation, _ in known.relations(np.arange(1, 10)).rows() if relation == name}
 
 
 def waiting_in_the_south(other_x, speed, moments=15):
@@ -73,7 +73,7 @@ def waiting_in_the_south(other_x, speed, moments=15):
 def test_who_waits_where_traffic_halts_yields_to_who_comes():
     known = judged(waiting_in_the_south(-34.0, 8.0), lines=HALTS_IN_THE_SOUTH)
     assert told(known) == {(1, 2)}
-    assert all(0.0 <= p <= 1.0 for p in known.probability.values())
+    assert all(0.0 <= p <= 1.0 for each in known.probability.values() for p in each)
 
 
 def test_nothing_is_kept_of_a_vehicle_that_is_someone_else():
@@ -103,7 +103,7 @@ def test_where_nobody_ever_stops_lines_tell_nothing():
     assert np.isinf(distance).all()
     assert (halts == 0).all()
     moments = [[(-40 + 1.6 * k, 0, EAST, 8.0), (0, -60 + 1.6 * k, NORTH, 8.0)] for k in range(10)]
-    assert all(0.0 <= p <= 1.0 for p in judged(moments).probability.values())
+    assert all(0.0 <= p <= 1.0 for each in judged(moments).probability.values() for p in each)
 
 
 def test_the_next_line_is_that_of_ones_own_lane_and_direction():
@@ -134,7 +134,7 @@ def braking_of(known, x, y, heading, speed, free=1.0, node=1):
 
 def test_who_yields_brakes_to_its_line_and_others_go_on():
     known = judged(waiting_in_the_south(-34.0, 8.0), lines=HALTS_IN_THE_SOUTH)
-    p = known.probability[1, 2]
+    p, _ = known.probability[1, 2]
     assert known.line[1, 2].tolist() == pytest.approx([0.0, -8.0])
     assert braking_of(known, 0, -18, NORTH, 5.0) == pytest.approx((1 - p) * 1.0 - p * 5.0**2 / 20)
     assert braking_of(known, 0, -8.1, NORTH, 0.0) == pytest.approx(1 - p), "it stands"
@@ -142,7 +142,7 @@ def test_who_yields_brakes_to_its_line_and_others_go_on():
     assert braking_of(known, 0, -5, NORTH, 5.0) == pytest.approx(1 - p), "it is beyond the line"
     assert braking_of(known, -10, 0, EAST, 8.0, node=2) == pytest.approx(1.0, abs=0.4), "it has the right of way"
     assert braking_of(known, 0, -18, NORTH, 5.0, node=7) == 1.0, "nothing is known of it"
-    joining = replace(known, probability={**known.probability, (2, 7): 0.99})
+    joining = replace(known, probability={**known.probability, (2, 7): (0.99, 0.0)})
     assert braking_of(joining, -10, 0, EAST, 8.0, node=2) == braking_of(known, -10, 0, EAST, 8.0, node=2), "no line"
 
 
@@ -181,7 +181,7 @@ def test_free_time_is_that_of_an_even_acceleration_up_to_the_cruising_speed():
 
 
 def test_probabilities_are_finite_for_extreme_evidence():
-    p = yielding(np.vstack([np.full(26, 1e6), np.full(26, -1e6), np.zeros(26)]))
+    p = probabilities(np.vstack([np.full(26, 1e6), np.full(26, -1e6), np.zeros(26)]))
     assert ((p >= 0) & (p <= 1)).all()
 
 
@@ -196,7 +196,7 @@ def frames(count=12, **more):
 
 def test_without_edges_that_answer_for_themselves_nobody_is_told_to_yield():
     tracker = Tracker(TrackerSettings())
-    assert all(len(tracker.step(frame).yields) == 0 for frame in frames())
+    assert all(len(tracker.step(frame).relations) == 0 for frame in frames())
 
 
 def test_a_parked_car_takes_no_part():
@@ -247,16 +247,16 @@ def test_a_stop_line_across_no_lane_changes_nothing():
     for one, other in zip(frames(), frames(road_map=alone), strict=True):
         a, b = plain.step(one), mapped.step(other)
         assert np.array_equal(a.boxes.position, b.boxes.position)
-        assert a.yields.rows() == b.yields.rows()
+        assert a.relations.rows() == b.relations.rows()
 
 
 def test_who_yields_goes_with_the_tracks_and_through_a_snapshot():
     tracker = Tracker(dense_traffic_settings())
-    telling = [tracks for tracks in map(tracker.step, frames(20)) if len(tracks.yields)]
+    telling = [tracks for tracks in map(tracker.step, frames(20)) if len(tracks.relations)]
     assert telling
     for tracks in telling:
-        assert np.isin([tracks.yields.source, tracks.yields.target], tracks.id).all()
-        assert len(tracks.select(tracks.id == tracks.id[0]).yields) == 0
+        assert np.isin([tracks.relations.source, tracks.relations.target], tracks.id).all()
+        assert len(tracks.select(tracks.id == tracks.id[0]).relations) == 0
     other = Tracker(dense_traffic_settings())
     other.restore(tracker.snapshot())
     assert other.snapshot().right_of_way.probability == tracker.snapshot().right_of_way.probability
