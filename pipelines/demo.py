@@ -1,7 +1,7 @@
 """The demo: simulated traffic, several trackers compared, a table and a page."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,24 +10,28 @@ from data_tools.figures import FigureTable, cell
 from data_tools.files import atomic_directory, write_text
 from data_tools.metrics import SceneMetrics, scene_metrics
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
-from data_tools.simulator.world import write_tables
+from data_tools.simulator.world import simulate_scene, write_tables
 from pipelines.config import Method, TrackConfig, load_config
 from pipelines.configuration import write_settings
 from pipelines.report import Report, report_page, scene_of_run
 from pipelines.tracking import Progress, TrackedScene, track_scene
 from saga_fg import Dataset, InputError, Scene
 from saga_fg.numerics import IntArray
-from saga_fg.types import DEFAULT
+from saga_fg.types import DEFAULT, RELATIONS
 
 __all__ = ["run_demo"]
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Runs of each method over the same scenes, and their metrics pooled over the scenes."""
+    """Runs of each method over the same scenes, and their metrics pooled over the scenes.
+
+    merge  runs of a merge between cones, by method, which is in no metrics
+    """
 
     runs: dict[Method, tuple[TrackedScene, ...]]
     metrics: dict[Method, SceneMetrics]
+    merge: Mapping[str, TrackedScene] = field(default_factory=dict)
 
     def milliseconds_per_frame(self, method: Method) -> float:
         """Median of the time the tracker took for a frame: the first ones may compile kernels."""
@@ -82,6 +86,9 @@ NOTE = (
     "Traffic seen by a LiDAR and a front camera on one of the cars, tracked by three methods. Watch cars that are "
     "hidden: where kf and centerpoint let them drive on, saga lets them brake with the queue they are in."
 )
+MERGE_METHODS: tuple[Method, ...] = ("kf", "saga")
+MERGE_SEED = 6  # after that of the others: of a merge in which somebody takes the right of way
+MERGE_NOTE = "The last scene is a merge between cones, seen from a mast; saga says who took whose right of way."
 TABLE_TITLE = (
     "Errors of tracks matched to true objects within 2 m; occluded: tracked while in view, seen by no sensor now, a "
     "lost one counts with 5 m; times are of the machine that made this page"
@@ -95,13 +102,20 @@ def run_demo(
     scenes: int = 3,
     seed: int = 0,
     progress: Progress | None = None,
+    merge: SimulatorSettings | None = None,
 ) -> Comparison:
     """Run the demonstration and write `index.html` into the folder `output`.
+
+    merge  of the last scene, between cones, by the settings for dense traffic; none if left out
 
     Raises `InputError` where the folder can't be written, before any work is done.
     """
     with atomic_directory(output) as folder:
         comparison = compare(SimulatedTraffic(simulator, scenes, seed), config, METHODS, progress=progress)
+        if merge is not None:
+            last, dense = simulate_scene(merge, seed + MERGE_SEED, "merge"), load_config("traffic")
+            runs = {str(method): track_scene(last, dense.new_tracker(method), progress) for method in MERGE_METHODS}
+            comparison = replace(comparison, merge=runs)
         scene, moment = hardest_moment(comparison)
         (folder / "index.html").write_text(report_page(_report(comparison, config, scene, moment)), encoding="utf-8")
     return comparison
@@ -111,18 +125,30 @@ def _report(comparison: Comparison, config: TrackConfig, first: int, start: int)
     """All scenes, that of row `first` first, at its moment `start`."""
     count = len(comparison.runs[METHODS[0]])
     order = [first, *(k for k in range(count) if k != first)]
-    rules = config.tracker.edges
+    rules, merge = config.tracker.edges, comparison.merge
+    scenes = [scene_of_run({m: comparison.runs[m][k] for m in METHODS}, rules, config.sensors) for k in order]
     return Report(
         "saga-fg demo",
         [f"{count} simulated scene" + "s" * (count != 1), *TITLES.values()],
-        [scene_of_run({m: comparison.runs[m][k] for m in METHODS}, rules, config.sensors) for k in order],
+        [*scenes, *([scene_of_run(merge, load_config("traffic").tracker.edges, {})] if merge else [])],
         [comparison_table(comparison, TABLE_TITLE)],
         configuration=write_settings(config, comments=False),
-        notes=[NOTE],
+        notes=[NOTE, *([" ".join([MERGE_NOTE, *merge_lines(merge["saga"])])] if merge else [])],
         start=start,
         ghosts=True,  # of these it tells
         beside="kf",
     )
+
+
+def merge_lines(run: TrackedScene) -> list[str]:
+    """Who took whose right of way, a sentence each, by when it was told first."""
+    told, start = dict[tuple[int, int], str](), float(run.scene.timestamps[0])
+    for tracks in run.tracks:
+        for source, target, name, p in tracks.relations.rows():
+            if name == RELATIONS[1]:
+                text = f"{tracks.timestamp - start:.1f} s: track {source} {name} track {target} (probability {p:.2f})."
+                told.setdefault((source, target), text)
+    return list(told.values())
 
 
 def hardest_moment(comparison: Comparison) -> tuple[int, int]:

@@ -364,15 +364,10 @@ def sample_sizes(kind: IntArray, rng: np.random.Generator) -> FloatArray:
     return np.asarray(mean + spread * np.clip(rng.standard_normal(mean.shape), -2, 2))
 
 
-def sample_kinds(count: int, settings: TrafficSettings, rng: np.random.Generator) -> IntArray:
-    """Random kinds (count,) of moving vehicles."""
-    shares = np.array([VAN_SHARE, settings.truck_share, settings.bus_share])
-    return rng.choice(len(KINDS), size=count, p=[1 - shares.sum(), *shares])
-
-
 def sample_fleet(count: int, desired_speed: float, traffic: TrafficSettings, rng: np.random.Generator) -> Fleet:
     """`count` random vehicles; `desired_speed`, m/s, is the mean over the drivers of cars."""
-    kind = sample_kinds(count, traffic, rng)
+    shares = np.array([VAN_SHARE, traffic.truck_share, traffic.bus_share])
+    kind = rng.choice(len(KINDS), size=count, p=[1 - shares.sum(), *shares])
 
     def spread(mean: float, factor: FloatArray | float = 1.0) -> FloatArray:
         deviation = np.clip(rng.standard_normal(count), -2.5, 2.5)

@@ -5,6 +5,7 @@ Scenarios:
 traffic      the default settings
 red-light    a queue before a traffic light; frames have a map, the camera reports colours
 road-works   cones close the right lane and move its traffic into the adjacent lane; the map does not have the cones
+merge        the same, seen from a mast; some drivers let nobody in
 towing       many trucks, most of them with a trailer
 two-sensors  a LiDAR with few points on far and small objects, and with outages; cameras that see far ahead
 """
@@ -44,6 +45,7 @@ class TrafficSettings(Settings):
     trailer_share: Fraction = setting(0.0, "share of the trucks that tow a trailer")
     platoon_size: PositiveCount = setting((3, 9), "fewest and most vehicles in a platoon")
     platoon_gap: NonNegativeSpan = setting((10.0, 60.0), "extra distance between platoons, m")
+    takers: Fraction = setting(0.0, "share of drivers who speed up where a lane ends, and let nobody in")
     signal_probability: Fraction = setting(0.7, "share of scenes with a traffic light; the others have a slow zone")
 
     def __post_init__(self) -> None:
@@ -203,6 +205,7 @@ class SimulatorSettings(Settings):
     )
     parking_probability: Fraction = setting(0.35, "share of roadsides with a strip of parked cars")
     pedestrian_groups: Count = setting((3, 8), "fewest and most groups of pedestrians within reach of the ego vehicle")
+    mast: bool = setting(False, "the sensors are on a mast beside the place where a lane ends, not on a vehicle")
     mapped: bool = setting(False, "give frames a map of traffic lights, stop lines and lanes")
     traffic: TrafficSettings = settings_group(TrafficSettings, "vehicles")
     sensors: dict[str, SensorSettings] = settings_group(
@@ -210,7 +213,7 @@ class SimulatorSettings(Settings):
     )
 
 
-ScenarioName = Literal["traffic", "red-light", "road-works", "towing", "two-sensors"]
+ScenarioName = Literal["traffic", "red-light", "road-works", "merge", "towing", "two-sensors"]
 
 
 _SETTINGS: Mapping[ScenarioName, SimulatorSettings] = {
@@ -227,6 +230,20 @@ _SETTINGS: Mapping[ScenarioName, SimulatorSettings] = {
         traffic=TrafficSettings(platoon_size=(2, 5), platoon_gap=(15.0, 60.0)),  # light: one lane less makes no jam
         roadworks_probability=1.0,
         mapped=True,
+    ),
+    "merge": SimulatorSettings(
+        duration=20.0,
+        warm_up=3.0,
+        annotation_range=80.0,
+        lanes=(1, 1),
+        oncoming_lanes=(1, 1),
+        merge_probability=1.0,
+        roadworks_probability=1.0,
+        parking_probability=0.0,
+        pedestrian_groups=(0, 0),
+        mast=True,
+        traffic=TrafficSettings(takers=0.6, truck_share=0.08, bus_share=0.02, platoon_gap=(3.0, 20.0)),
+        sensors={"lidar": replace(lidar(), position=(0.0, 0.0, 7.0), max_range=80.0, reach=90.0, clutter_rate=1.0)},
     ),
     "towing": SimulatorSettings(traffic=TrafficSettings(truck_share=0.35, bus_share=0.02, trailer_share=0.8)),
     "two-sensors": SimulatorSettings(

@@ -213,6 +213,7 @@ CHANGE_INTERVAL = 0.5  # s between two decisions to change lanes
 SLOWEST_CHANGE = 2.0  # m/s, lowest speed at which a voluntary lane change starts
 REACTION_TIME = 0.3  # s between a change in traffic and the driver's response
 ACCELERATION_NOISE = 0.2  # standard deviation of the random acceleration, m/s^2
+HURRY = 2.5  # m/s^2, of those who let nobody in
 NOISE_TIME = 3.0  # correlation time of the random acceleration, s
 
 
@@ -237,6 +238,7 @@ class Traffic:
     step   time step, s
     noise  standard deviation of the random acceleration, m/s^2; reaction: time of the drivers, s
     early  spread of the positions at which drivers leave a lane closed by cones, m
+    takers share of drivers who speed up where a lane ends, and let nobody in
     """
 
     def __init__(
@@ -247,6 +249,7 @@ class Traffic:
         early: float = 0.0,
         noise: float = ACCELERATION_NOISE,
         reaction: float = REACTION_TIME,
+        takers: float = 0.0,
     ) -> None:
         self._lanes, self._fleet, self._deviation, self._rng = layout.lanes, layout.fleet, noise, rng
         self._stop_lines, self._slow_zones, self._step = layout.stop_lines, layout.slow_zones, step
@@ -264,6 +267,7 @@ class Traffic:
         self._pending = [np.zeros(n)] * round(reaction / step)
         self._steps = 0
         self._early = rng.uniform(0.0, early, n) if early > 0 else np.zeros(n)
+        self._takes = rng.spawn(1)[0].random(n) < takers
 
     @property
     def on_road(self) -> BoolArray:
@@ -333,7 +337,10 @@ class Traffic:
             term = following_acceleration(v, np.maximum(gap, 0.0), v[leader], drivers)
             pull = np.minimum(pull, np.where(leader >= 0, term, 0.0))
         pull = np.minimum(np.minimum(pull, self._stops()), self._courtesy(order))
-        return np.maximum(free_acceleration(v, drivers, limit) + pull, -HARDEST_BRAKING)
+        free = free_acceleration(v, drivers, limit)
+        near = (s >= self._lanes.opening) & (s < self._lanes.end)
+        hurries = self._takes & near & np.isin(self.lane, [self._lanes.ending, self._lanes.adjacent])
+        return np.maximum(np.where(hurries, HURRY, free) + pull, -HARDEST_BRAKING)
 
     def _stops(self) -> FloatArray:
         """Interaction with red lights and with the end of the ending lane (N,), m/s^2."""
@@ -357,7 +364,7 @@ class Traffic:
 
     def _courtesy(self, order: LaneOrder) -> FloatArray:
         """Zip merging (N,), m/s^2: a vehicle in the ending lane follows the next vehicle of the adjacent lane, and the
-        vehicle behind it in that lane follows it; both brake comfortably at most.
+        vehicle behind it in that lane follows it; both brake comfortably at most, takers not at all.
         """
         pull = np.zeros(len(self.s))
         if self._lanes.ending < 0:
@@ -367,7 +374,7 @@ class Traffic:
         target = np.full(len(rows), self._lanes.adjacent)
         pairs = ((rows, order.ahead(target, self.s[rows])), (order.behind(target, self.s[rows]), rows))
         for behind, front in pairs:
-            both = (behind >= 0) & (front >= 0)
+            both = (behind >= 0) & (front >= 0) & ~self._takes[behind]
             i, j = behind[both], front[both]
             gap = np.maximum(self.s[j] - self.s[i] - (self._fleet.length[i] + self._fleet.length[j]) / 2, 0.0)
             drivers = self._fleet.drivers.select(i)

@@ -51,6 +51,7 @@ from saga_fg.types import Dataset, Detections, Frame, Scene
 SURROUNDED = (-300.0, 400.0)  # m along the road from the focus: extent of buildings, hedges, parked cars
 POPULATED = (-150.0, 100.0)  # m along the road from the focus: start positions of pedestrians
 UPSTREAM = (15.0, 140.0)  # m before the focus: start positions of the ego vehicle
+BEFORE, ASIDE = 20.0, 2.0  # m before the focus, and beside all traffic: the mast
 EARLY_MERGE = 10.0  # distance between the earliest and the latest positions of leaving the lane, m
 STEP = 0.05  # integration step, s
 
@@ -89,7 +90,7 @@ def build_world(settings: SimulatorSettings, seed: int) -> World:
         layout.lanes.road, around.pavements, populated, history.time, settings.pedestrian_groups, streams[4]
     )
     parked = static_objects(_ids("parked", len(around.parked)), around.parked, history.time)
-    others = vehicles.select(np.delete(np.arange(len(vehicles)), ego))
+    others = vehicles if settings.mast else vehicles.select(np.delete(np.arange(len(vehicles)), ego))
     boxes = sample_cones(layout.lanes, streams[6])
     cones = static_objects(_ids("cone", len(boxes)), boxes, history.time)
     signals = signals_of(layout.lanes, layout.stop_lines)
@@ -98,14 +99,16 @@ def build_world(settings: SimulatorSettings, seed: int) -> World:
         road_map = sample_map(layout.lanes, layout.focus, layout.stop_lines, signals, streams[7])
     carrier = vehicles.select(np.array([ego]))
     objects = concatenated([others, trailers, people, parked, cones])
-    ego_pose = partial(pose_on_ground, carrier)
+    beside = layout.lanes.road.position(np.array(layout.focus - BEFORE), np.array(layout.borders[0] - ASIDE))
+    mast = yaw_transform(float(beside[0]), float(beside[1]), 0.0, 0.0)
+    ego_pose = (lambda time: mast) if settings.mast else partial(pose_on_ground, carrier)
     return World(objects, around.occluders, ego_pose, signals, road_map, carrier, layout, history)
 
 
 def simulate_traffic(layout: SceneLayout, settings: SimulatorSettings, rng: np.random.Generator) -> TrafficHistory:
     """Run the warm-up, then record slightly more than the scene's duration."""
     early = EARLY_MERGE if layout.lanes.taper > 0 else 0.0
-    traffic = Traffic(layout, rng, STEP, early)
+    traffic = Traffic(layout, rng, STEP, early, takers=settings.traffic.takers)
     for _ in range(round(settings.warm_up / STEP)):
         traffic.step()
     return record_traffic(traffic, int(np.ceil(settings.duration / STEP)) + 2)

@@ -14,7 +14,7 @@ from pipelines.cli.console import counted, progress_bar, show_tables, working
 from pipelines.cli.options import Config, Verbose, as_command
 from pipelines.config import Family, load_config
 from pipelines.configuration import load_settings, write_settings
-from pipelines.demo import comparison_table, run_demo, write_simulated_tables
+from pipelines.demo import MERGE_NOTE, comparison_table, merge_lines, run_demo, write_simulated_tables
 from pipelines.serving import StreamSettings
 from pipelines.slam.configuration import load_slam_config
 from pipelines.smoothing import load_smooth_config
@@ -145,16 +145,19 @@ def demo(
       saga-fg demo --output out --scenario road-works --scenes 1
     """
     with progress_bar() as progress:
-        family = "simulated" if scenario in ("traffic", "two-sensors") else "heterogeneous"
+        family = "traffic" if scenario == "merge" else "simulated" if scenario in MAPLESS else "heterogeneous"
+        merge = scenario_settings("merge") if scenario == "traffic" else None
         settings = load_config(family, config)
-        comparison = run_demo(output, settings, scenario_settings(scenario), scenes, seed, progress)
+        comparison = run_demo(output, settings, scenario_settings(scenario), scenes, seed, progress, merge)
     title = f"{counted(scenes, 'simulated scene')}, seed {seed}"
     show_tables([comparison_table(comparison, title)])
     typer.echo(READING)
+    if comparison.merge:
+        typer.echo("\n".join([MERGE_NOTE, *merge_lines(comparison.merge["saga"])]))
     typer.echo(f"page: {output / 'index.html'}")
 
 
-MAPLESS: tuple[ScenarioName, ...] = ("traffic", "two-sensors")
+MAPLESS: tuple[ScenarioName, ...] = ("traffic", "merge", "two-sensors")
 """Scenarios without lights and lanes as objects, which the nuScenes layout has no place for."""
 
 
@@ -164,9 +167,7 @@ def simulate(
     seed: Annotated[int, typer.Option("--seed", min=0, help="The same seed makes the same scenes.")] = 0,
     scenario: Annotated[
         ScenarioName,
-        typer.Option(
-            "--scenario", help="What the scenes are about; all but traffic and two-sensors are written as tables."
-        ),
+        typer.Option("--scenario", help="What the scenes are about; those with a map are written as tables."),
     ] = "traffic",
     config: Annotated[
         Path | None, typer.Option("--config", help="YAML file; see `saga-fg config --simulator`.", metavar="FILE")

@@ -188,6 +188,19 @@ def test_a_map_tells_which_lanes_a_light_stops():
             assert np.cos(heading[0] - found.heading) > 0.99
 
 
+def test_takers_let_nobody_in_and_the_mast_stands():
+    """Without takers some brake for those who merge that do not brake for a taker."""
+    merge = settings("merge")
+    polite = replace(merge, traffic=replace(merge.traffic, takers=0.0))
+    one, other = (build_world(each, 3) for each in (merge, polite))
+    lanes = one.layout.lanes
+    near = np.isin(other.history.lane, [lanes.ending, lanes.adjacent]) & (other.history.s < lanes.end)
+    before = near & (other.history.s > lanes.opening)
+    assert one.history.speed[before].max() > other.history.speed[before].max() + 1.0
+    assert np.array_equal(one.ego_pose(0.0), one.ego_pose(5.0))
+    assert one.ego.id[0] in one.objects.id, "no vehicle carries the sensors"
+
+
 def test_cones_push_the_traffic_of_their_lane_into_the_one_beside():
     here = world("road-works")
     lanes, history = here.layout.lanes, here.history
