@@ -294,16 +294,11 @@ class Traffic:
         turn = smooth_step_slope(q) / self._change_length
         return d0 + weight * (d - d0), slope0 + weight * (slope - slope0) + turn * (d - d0)
 
-    def _metric(self) -> FloatArray:
-        """Length over ground per unit of s (N,)."""
-        d, slope = self.lateral()
-        return self._lanes.metric(self.lane, self.s, d, slope)
-
     def step(self) -> None:
         """Advance all vehicles by one time step."""
         h = self._step
         order = self.order()
-        metric = self._metric()
+        metric = self._lanes.metric(self.lane, self.s, *self.lateral())  # length over ground per unit of s
         desired = self._desired_acceleration(order, metric)
         if self._steps % max(1, round(CHANGE_INTERVAL / h)) == 0:
             self._start_changes(desired, order)

@@ -30,7 +30,7 @@ from saga_fg.learning.labelled_scene import DetectionSample, SampledDetections, 
 from saga_fg.learning.process_noise import MeasuredTrajectory, innovation_likelihood
 from saga_fg.learning.sensor_fit import FEWEST, MIN_PARAMETER, PRIOR_WIDTH, robust_deviation
 from saga_fg.model import NoiseModel, Sensor, sensor_model
-from saga_fg.numerics import Assignment, FloatArray, IntArray, StrArray, wrap_angle
+from saga_fg.numerics import FloatArray, IntArray, StrArray, wrap_angle
 from saga_fg.tracking import Tracker
 from saga_fg.types import Detections, Frame, Scene, class_settings
 
@@ -94,7 +94,9 @@ def sample_with_tracker(
     linked = []
     for frame in scene.frames:
         tracker.step(frame)
-        linked.append(_linked(frame, sensor_model(sensors, frame.sensor), tracker.assignment))
+        track, sensor = np.full(len(frame), -1, dtype=np.int64), sensor_model(sensors, frame.sensor)
+        track[tracker.assignment.detection] = tracker.assignment.id
+        linked.append(_Linked(frame, sensor, sensor.measured_at(frame), sensor.in_world(frame), track))
     trajectories = _trajectories(linked)
     in_view = _in_view(trajectories, linked)
     count = Counter(number for tracks, _ in in_view.values() for number in tracks.tolist())
@@ -116,12 +118,6 @@ def sample_with_tracker(
         tracks, seen = in_view.get(name, (ids[:0], SampledObjects.empty()))
         samples[name] = DetectionSample(SampledDetections.concatenate(detections), seen.select(np.isin(tracks, ids)))
     return list(objects.values()), samples
-
-
-def _linked(frame: Frame, sensor: Sensor, assignment: Assignment) -> _Linked:
-    track = np.full(len(frame), -1, dtype=np.int64)
-    track[assignment.detection] = assignment.id
-    return _Linked(frame, sensor, sensor.measured_at(frame), sensor.in_world(frame), track)
 
 
 def _trajectories(linked: Sequence[_Linked]) -> dict[int, DetectedTrajectory]:

@@ -146,11 +146,6 @@ class OffsetEstimate:
     agreed: bool
     steady: bool
 
-    @property
-    def significant(self) -> bool:
-        """Return True for an offset that is to be corrected."""
-        return self.steady and abs(self.offset) > max(MIN_OFFSET, 4 * self.deviation)
-
 
 @dataclass(frozen=True, eq=False)
 class PairSamples:
@@ -390,7 +385,7 @@ def compared(
     for name, found in now.estimates(clock.records()).items():
         own = clock.sensor(name)
         assert own is not None
-        if found.significant or (found.steady and own.offset != 0):
+        if found.steady and (own.offset != 0 or abs(found.offset) > max(MIN_OFFSET, 4 * found.deviation)):
             offset = round(found.offset, 6)
             if own.offset == 0:
                 text = "the clock of %s is %+.3f s off (+- %.3f s), by %d objects in common: corrected from now on"
