@@ -7,7 +7,7 @@ variance of a detection:
     D_k = sum over j of c_j z_j,   c_j = product over i /= j of 1 / (t_j - t_i),   cov D_k = R sum over j of c_j^2
     s^2 = least over k = 1, 2, 3 of the 90 % quantile of ( D_k^T R^-1 D_k / sum of c_j^2 ) / chi^2_2(90 %)
 
-with R the noise by the sensor's model. Orders that motion is still part of are larger, and the quantile is that up to
+with R the noise by the sensor's model. Orders that motion is still part of are larger, so that the first alone never raises s, and the quantile is that up to
 which ellipses are meant to hold. The s of a class is drawn to that of all classes, as if they had `OF_GROUP`
 differences in it, that of a band of range to its class, and s^2 = a^2 + (g r)^2 is fitted to the bands. Until there are
 enough differences, gates are those of `UNKNOWN` times its noise: with too small ones a tracker would only see the small
@@ -141,6 +141,8 @@ def _scale(parts: Sequence[_Squares], whole: float, prior: float) -> float:
     if not known:
         return whole
     variance = min(float(np.quantile(each, QUANTILE)) for each in known) / gate(QUANTILE)
+    if all(len(each) < FEWEST for each in orders[1:]):  # what is larger then may be motion
+        variance = min(variance, whole**2)
     count = max(len(each) for each in known)
     s = math.exp((math.log(max(variance, 1e-12)) / 2 * count + math.log(whole) * prior) / (count + prior))
     trust = min(max((s - SHARED[0]) / (SHARED[1] - SHARED[0]), 0.0), 1.0)

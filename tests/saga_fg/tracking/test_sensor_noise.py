@@ -46,6 +46,12 @@ def test_the_scale_stays_within_bounds_and_waits_for_evidence():
     assert seen(0.3, lambda t: np.zeros(2), rng, frames=2, objects=5).scale == 1.0
 
 
+def test_motion_never_passes_for_noise_while_little_is_known():
+    rng = np.random.default_rng(2)
+    for frames in range(5, 12):
+        assert seen(0.3, lambda t: np.array([20 * t, 0.0]), rng, frames, objects=40).scale <= 1.15
+
+
 def test_the_scale_stays_after_the_first_seconds():
     rng = np.random.default_rng(3)
     noise = seen(0.15, lambda t: np.zeros(2), rng, frames=120)
