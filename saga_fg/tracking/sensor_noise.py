@@ -7,11 +7,11 @@ variance of a detection:
     D_k = sum over j of c_j z_j,   c_j = product over i /= j of 1 / (t_j - t_i),   cov D_k = R sum over j of c_j^2
     s^2 = least over k = 1, 2, 3 of the 90 % quantile of ( D_k^T R^-1 D_k / sum of c_j^2 ) / chi^2_2(90 %)
 
-with R the noise by the sensor's model. Orders that motion is still part of are larger, so that the first alone never raises s, and the quantile is that up to
-which ellipses are meant to hold. The s of a class is drawn to that of all classes, as if they had `OF_GROUP`
-differences in it, that of a band of range to its class, and s^2 = a^2 + (g r)^2 is fitted to the bands. Until there are
-enough differences, gates are those of `UNKNOWN` times its noise: with too small ones a tracker would only see the small
-errors.
+with R the noise by the sensor's model. Orders that motion is still part of are larger, so that the first alone never
+raises s, and the quantile is that up to which ellipses are meant to hold. The s of a class is drawn to that of all
+classes, as if they had `OF_GROUP` differences in it, that of a band of range to its class, and s^2 = a^2 + (g r)^2 is
+fitted to the bands. Until there are enough differences, gates are those of `UNKNOWN` times its noise: with too small
+ones a tracker would only see the small errors.
 
 More noise than the model says widens gates and slows the filter (factor max(s, 1) on the deviations R). Less noise
 narrows the reported ellipses alone (min(s, 1), `saga_fg.tracking.track_life`): errors that all detections of an object
