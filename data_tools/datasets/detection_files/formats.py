@@ -33,6 +33,7 @@ from saga_fg.tables import (
     sorted_by_time,
     understood,
 )
+from saga_fg.types import LATEST
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +41,7 @@ Row = TypeVar("Row")
 ROWS = 50_000  # of a part of a table
 OF_FRAMES = frozenset(("scene", "timestamp", "sensor", "coordinates", *POSE))
 DEEPEST = 8  # levels of a JSON object that are taken apart
+STAMPS = (("nanosec", "sec"), ("nsec", "sec"), ("nsecs", "secs"), ("nanos", "seconds"))  # parts of a time
 TRACK_MEANINGS = ("id",)  # of tracks, which need no word where detections are read
 _OPEN_QUOTE = "a quote is opened and not closed on this line"
 
@@ -262,7 +264,10 @@ def _json_rows(path: Path, file: TextIO) -> Iterator[tuple[int, dict[str, Any]]]
 def _plain_values(
     within: tuple[str, ...], values: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, list[dict[str, Any]]]]:
-    """The values of a JSON object by their names in a table, and its lists of objects; a vector has x, y and z."""
+    """The values of a JSON object by their names in a table, and its lists of objects.
+
+    A list of up to three has x, y and z; seconds and nanoseconds are one time, s.
+    """
     plain: dict[str, Any] = {}
     lists: dict[str, list[dict[str, Any]]] = {}
     for key, value in values.items():
@@ -271,14 +276,23 @@ def _plain_values(
             continue  # a frame without objects
         if value and isinstance(value, list) and all(isinstance(each, dict) for each in value):
             lists[key] = value
-        elif value and isinstance(value, dict | list) and len(path) < DEEPEST:
-            parts = value if isinstance(value, dict) else dict(zip("xyz", value, strict=False))
-            deeper = _plain_values(path, parts)
+            continue
+        if value and isinstance(value, list) and len(value) <= 3:
+            value = dict(zip("xyz", value, strict=False))
+        if isinstance(value, dict) and tuple(sorted(value)) in STAMPS and all(map(_is_whole, value.values())):
+            nanoseconds, seconds = (value[part] for part in sorted(value))
+            plain[_joined(path)] = seconds + 1e-9 * nanoseconds
+        elif value and isinstance(value, dict) and len(path) < DEEPEST:
+            deeper = _plain_values(path, value)
             plain |= deeper[0]
             lists |= deeper[1]
         else:
             plain[_joined(path)] = value
     return plain, lists
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and abs(value) <= LATEST
 
 
 @lru_cache(1024)

@@ -133,16 +133,17 @@ def test_csv_and_ndjson_agree(tmp_path_factory, table):
 
 
 def test_nested_values_have_the_names_of_columns(tmp_path):
-    """A vector has x, y and z; what is said of the vehicle is not taken for the object's."""
+    """A vector has x, y and z, a quaternion in a list is none; what is said of the vehicle is not the object's."""
     frame = {
-        "time": 1.0,
+        "header": {"stamp": {"sec": 1, "nanosec": 250_000_000}},
         "ego": {"x": 5.0, "y": 6.0, "yaw": 0.0},
         "objects": [
-            {"class": "car", "pose": {"position": [1, 2, 3], "yaw": 0.5}, "velocity": [4, 5], "feature": [9] * 5}
+            {"class": "car", "pose": {"position": [1, 2, 3], "yaw": 0.5}, "velocity": [4, 5], "rotation": [1, 0, 0, 0]}
         ],
     }
     scene = read_detections(write(tmp_path, ".ndjson", json.dumps(frame))).scene("drive")
     boxes = scene.frames[0].detections.boxes
+    assert scene.frames[0].timestamp == 1.25
     assert (boxes.label.tolist(), boxes.position.tolist(), boxes.yaw.tolist()) == (["car"], [[1, 2, 3]], [0.5])
     assert (boxes.velocity.tolist(), np.isnan(boxes.size).all()) == ([[4, 5]], True)
     assert scene.world_T_ego[0, :2, 3].tolist() == [5, 6]
