@@ -6,6 +6,7 @@ A name is compared without case, and with `_` for spaces, dots and dashes. Its e
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -320,7 +321,8 @@ def option_text(entries: Mapping[str, Any], within: str = COMMAND) -> str:
         texts = {name: _of_option(value) for name, value in entries.items() if value}
         return " ".join(f"--{name.replace('_', '-')} {text}".rstrip() for name, text in texts.items())
     if within.startswith(COMMAND):
-        return f"{within} ({', '.join(f'{name}: {_of_yaml(value)}' for name, value in entries.items())})"
+        lines = (f"{name}: {json.dumps(value, ensure_ascii=False)}" for name, value in entries.items())
+        return f"{within} ({', '.join(lines)})"
     return f"{within}=TableImport({', '.join(f'{name}={value!r}' for name, value in entries.items())})"
 
 
@@ -328,12 +330,6 @@ def _of_option(value: Any) -> str:
     if value is True:
         return ""
     return shlex.quote(value if isinstance(value, str) else ",".join(f"{a}={b}" for a, b in value.items()))
-
-
-def _of_yaml(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{a}: {_of_yaml(b)}' for a, b in value.items())}}}"
-    return str(value).lower() if value is True else value or "''"
 
 
 def _plain(name: str) -> str:

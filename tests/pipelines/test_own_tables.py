@@ -10,11 +10,13 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+import yaml
 
 from pipelines.config import load_config
 from pipelines.report.page import read_run_record
 from saga_fg import Boxes, Detections, Frame
 from saga_fg.smoothing import smooth as labelled
+from saga_fg.tables import option_text
 from saga_fg.tracking import Tracker
 from saga_fg.types.road_map import RoadMap
 from tests.pipelines.strangers_tables import T0, rows, run_line, saga_fg, write
@@ -506,7 +508,10 @@ def test_what_mends_the_truth_alone_is_named_by_its_own_option(tmp_path):
     how = tmp_path / "how.yaml"
     how.write_text("classes: {VEHICLE: car}\n")
     result = saga_fg("evaluate", "file", gt, "--units", "angle=deg", "--truth", gt, "--truth-import", how)
-    assert "add --truth-import (units: {angle: deg}); --truth-import (as_given: true) reads it" in result.output
+    assert 'add --truth-import (units: {"angle": "deg"}); --truth-import (as_given: true) reads it' in result.output
+    text = option_text({"columns": {"x": "pos: e", "y": "no"}, "as_given": True}, "--truth-import")
+    read = yaml.safe_load(f"{{{text.partition('(')[2][:-1]}}}")
+    assert read == {"columns": {"x": "pos: e", "y": "no"}, "as_given": True}
     how.write_text("classes: {VEHICLE: car}\nunits: {angle: deg}\n")
     options = ("--units", "angle=deg", "--classes", "VEHICLE=car")
     assert saga_fg("evaluate", "file", gt, *options, "--truth", gt, "--truth-import", how).exit_code == 0
