@@ -2,6 +2,7 @@
 
 import base64
 import html
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -34,12 +35,13 @@ def drive_page(folder: Path) -> str:
     pictures = {"Map and path": read_bytes(folder / "above.png")} if (folder / "above.png").is_file() else {}
     if (folder / "reference.tum").is_file():
         pictures["Drift"] = _drift(paths, read_tum_poses(folder / "reference.tum"))
+    loops = _loops(folder)
     with error_context(f"{folder}: metrics.json"):
         try:
-            tables = [_errors(figures), _loops(folder), _open_motions(figures)]
+            tables = [_errors(figures), loops, _open_motions(figures)]
             facts = [f"{figures[name]} {name}" for name in ("keyframes", "submaps", "loops")]
             facts += [f"{figures['false_loops']} loops left out as false", *figures["misfits"].values()]
-        except (KeyError, TypeError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(f"expected the figures of a run: {error!r}") from error
     return _PAGE.format(
         title=html.escape(f"SLAM: {folder.resolve().name}"),
@@ -69,15 +71,12 @@ def _drift(paths: Mapping[str, Trajectory], reference: Trajectory) -> bytes:
 def _errors(figures: Mapping[str, Any]) -> FigureTable:
     columns = ("ATE, m", "end, m", "RPE, m", "RPE, deg", "over, m")
     named = {name: figures[name] for name in (*_PATHS, "without_objects") if name in figures}
-    rows = [
-        (
-            name.replace("_", " "),
-            *(cell(float(e[key] or np.nan)) for key in ("ate", "end_error", "relative_translation")),
-            cell(float(np.degrees(e["relative_rotation"] or np.nan))),
-            cell(float(e["relative_distance"]), 0),
-        )
-        for name, e in named.items()
-    ]
+    keys = ("ate", "end_error", "relative_translation", "relative_rotation", "relative_distance")
+    rows = []
+    for name, errors in named.items():
+        ate, end, shift, turn, far = (np.nan if errors[key] is None else float(errors[key]) for key in keys)
+        over = cell(far, 0)
+        rows.append((name.replace("_", " "), *map(cell, (ate, end, shift, math.degrees(turn))), over))
     return FigureTable("Errors against the recording", ("path", *columns), tuple(rows))
 
 

@@ -92,6 +92,8 @@ def read_session(folder: str | Path) -> Session:
     columns = 22  # a time, and the upper triangle of a covariance
     table = read_table(folder / "covariances.csv", (columns,), "timestamp,P11,...", ",")
     times = replace(table, values=table.values[1:], line=table.line[1:]).numbers([0], ("timestamp",))[:, 0]
+    if (np.diff(times) <= 0).any():
+        raise InputError(f"{folder / 'covariances.csv'}: timestamp: expected increasing times")
     if len(times) != len(graph):
         raise InputError(f"{folder}: expected as many rows of covariances.csv as poses of graph.g2o, got {len(times)}")
     return Session(folder.resolve().name, slam_map, graph, times, read_tum_poses(folder / "trajectory.tum"))
@@ -148,12 +150,9 @@ def _loops(merged: MergedDrives, session: Session) -> tuple[FloatArray, list[Loo
             f"{session.name}: expected places in common with {others}: {len(largest)} of {len(frames)} submaps agree "
             f"on where the drive is, at least {_FEWEST} must"
         )
-    carriers, own = session.carriers, session.graph.world_T_pose
-    loops = []
+    carriers, own, loops = session.carriers, session.graph.world_T_pose, list[LoopClosure]()
+    there = merged.graph.world_T_pose[:-1]  # a loop from the last to the first of this drive would pass for odometry
     for number, one in (found[k] for k in largest):
-        there = merged.graph.world_T_pose[
-            :-1
-        ]  # a loop from the last to the first of this drive would pass for odometry
         first = int(np.linalg.norm(there[:, :3, 3] - one.map_T_scan[:3, 3], axis=1).argmin())
         keyframe_T_submap = inverse_transform(own[carriers[number]]) @ frames[number]
         measured = inverse_transform(there[first]) @ one.map_T_scan @ inverse_transform(keyframe_T_submap)

@@ -72,17 +72,20 @@ def test_drives_without_places_in_common_are_refused(runs: Path) -> None:
 
 
 def test_folders_that_are_no_runs_are_one_line(runs: Path, tmp_path: Path, subtests) -> None:
-    for name in ("cut", "short"):
+    for name in ("cut", "short", "unordered"):
         shutil.copytree(runs / "back", tmp_path / name)
     (tmp_path / "cut" / "graph.g2o").unlink()
     table = tmp_path / "short" / "covariances.csv"
-    table.write_text("\n".join(table.read_text().splitlines()[:-1]) + "\n")
+    head, *rows = table.read_text().splitlines()
+    table.write_text("\n".join([head, *rows[:-1]]) + "\n")
+    (tmp_path / "unordered" / "covariances.csv").write_text("\n".join([head, *reversed(rows)]) + "\n")
     there, output = runs / "there", tmp_path / "both"
     for given, message in [
         ([there], "RUN: expected two folders or more of different names, got there"),
         ([there, there], "got there, there"),
         ([there, tmp_path / "none"], "none: expected graph.g2o, as"),
         ([there, tmp_path / "cut"], "graph.g2o"),
+        ([there, tmp_path / "unordered"], "covariances.csv: timestamp: expected increasing times"),
         ([there, tmp_path / "short"], "expected as many rows of covariances.csv as poses of graph.g2o"),
     ]:
         with subtests.test(message):
@@ -95,19 +98,20 @@ def test_a_page_shows_drift_errors_and_open_motions(runs: Path, tmp_path: Path) 
     shutil.copytree(runs / "there", tmp_path / "drive")
     figures = json.loads((tmp_path / "drive" / "metrics.json").read_text())
     figures["degenerate"] = [{"first": 4, "last": 9, "from": 0.4, "until": 0.9, "motions": ["along the road"]}]
+    figures["odometry"]["ate"] = 0.0
     (tmp_path / "drive" / "metrics.json").write_text(json.dumps(figures))
     done("report", "slam", tmp_path / "drive", "--output", tmp_path / "drive.html")
     page = (tmp_path / "drive.html").read_text()
     assert page.count("data:image/png;base64,") == 2
     assert "<td>4 to 9</td><td>0.5</td><td>along the road</td>" in page
     assert f"<td>trajectory</td><td>{figures['trajectory']['ate']:.3f}</td>" in page
-    del figures["false_loops"]
-    (tmp_path / "drive" / "metrics.json").write_text(json.dumps(figures))
-    for folder, message in [
-        (tmp_path / "drive", "metrics.json: expected the figures of a run"),
-        (tmp_path, "expected"),
-    ]:
-        assert message in refused("report", "slam", folder, "--output", tmp_path / "none.html")
+    assert "<td>odometry</td><td>0.000</td>" in page
+    without = {name: value for name, value in figures.items() if name != "false_loops"}
+    for broken in (without, figures | {"online": figures["online"] | {"ate": "none"}}):
+        (tmp_path / "drive" / "metrics.json").write_text(json.dumps(broken))
+        shown = refused("report", "slam", tmp_path / "drive", "--output", tmp_path / "none.html")
+        assert "metrics.json: expected the figures of a run" in shown
+    assert "expected" in refused("report", "slam", tmp_path, "--output", tmp_path / "none.html")
     assert not (tmp_path / "none.html").exists()
 
 
