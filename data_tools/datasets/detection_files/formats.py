@@ -18,7 +18,6 @@ from saga_fg.tables import (
     COLUMNS,
     COMMAND,
     NAMED,
-    POSE,
     REQUIRED,
     Clock,
     Columns,
@@ -39,7 +38,8 @@ log = logging.getLogger(__name__)
 
 Row = TypeVar("Row")
 ROWS = 50_000  # of a part of a table
-OF_FRAMES = frozenset(("scene", "timestamp", "sensor", "coordinates", *POSE))
+_VEHICLE = tuple(name for name in COLUMNS if name.startswith(("ego_", "odometry_", "gps_")))
+OF_FRAMES = frozenset(("scene", "timestamp", "sensor", "coordinates", *_VEHICLE))
 DEEPEST = 8  # levels of a JSON object that are taken apart
 STAMPS = (("nanosec", "sec"), ("nsec", "sec"), ("nsecs", "secs"), ("nanos", "seconds"))  # parts of a time
 TRACK_MEANINGS = ("id",)  # of tracks, which need no word where detections are read
@@ -242,6 +242,7 @@ def _read_ndjson(reading: _Reading) -> Iterator[RawTable]:
 
 
 def _json_rows(path: Path, file: TextIO) -> Iterator[tuple[int, dict[str, Any]]]:
+    names = set[str]()  # of lists of objects
     for number, line in enumerate(file, start=1):
         if not line.strip():
             continue
@@ -251,18 +252,22 @@ def _json_rows(path: Path, file: TextIO) -> Iterator[tuple[int, dict[str, Any]]]
         if not any(isinstance(value, dict | list) for value in row.values()):
             yield number, row
             continue
-        of_frame, lists = _plain_values((), row)
-        if len(lists) > 1:
-            raise InputError(f"{path}: line {number}: expected one list of objects, got {', '.join(sorted(lists))}")
-        for entry in next(iter(lists.values()), [{}]):
+        common, lists = _plain_values((), row)
+        filled = {name: entries for name, entries in lists.items() if entries}
+        if len(filled) > 1:
+            raise InputError(f"{path}: line {number}: expected one list of objects, got {', '.join(sorted(filled))}")
+        names |= filled.keys()
+        if not names.isdisjoint(lists):
+            common, _ = _plain_values((), row, of_frame=True)
+        for entry in next(iter(filled.values()), [{}]):
             own, deeper = _plain_values((), entry)
-            if deeper:
+            if any(deeper.values()):
                 raise InputError(f"{path}: line {number}: {min(deeper)}: expected no list of objects in an object")
-            yield number, {**of_frame, **own}
+            yield number, {**common, **own}
 
 
 def _plain_values(
-    within: tuple[str, ...], values: Mapping[str, Any]
+    within: tuple[str, ...], values: Mapping[str, Any], of_frame: bool = False
 ) -> tuple[dict[str, Any], dict[str, list[dict[str, Any]]]]:
     """The values of a JSON object by their names in a table, and its lists of objects.
 
@@ -272,22 +277,20 @@ def _plain_values(
     lists: dict[str, list[dict[str, Any]]] = {}
     for key, value in values.items():
         path = (*within, key)
-        if value == [] and meaning(key) is None:
-            continue  # a frame without objects
-        if value and isinstance(value, list) and all(isinstance(each, dict) for each in value):
+        if isinstance(value, list) and all(isinstance(each, dict) for each in value) and (value or not meaning(key)):
             lists[key] = value
             continue
         if value and isinstance(value, list) and len(value) <= 3:
             value = dict(zip("xyz", value, strict=False))
         if isinstance(value, dict) and tuple(sorted(value)) in STAMPS and all(map(_is_whole, value.values())):
             nanoseconds, seconds = (value[part] for part in sorted(value))
-            plain[_joined(path)] = seconds + 1e-9 * nanoseconds
+            plain[_joined(path, of_frame)] = seconds + 1e-9 * nanoseconds
         elif value and isinstance(value, dict) and len(path) < DEEPEST:
-            deeper = _plain_values(path, value)
+            deeper = _plain_values(path, value, of_frame)
             plain |= deeper[0]
             lists |= deeper[1]
         else:
-            plain[_joined(path)] = value
+            plain[_joined(path, of_frame)] = value
     return plain, lists
 
 
@@ -296,14 +299,18 @@ def _is_whole(value: Any) -> bool:
 
 
 @lru_cache(1024)
-def _joined(path: tuple[str, ...]) -> str:
+def _joined(path: tuple[str, ...], of_frame: bool) -> str:
     """Name of a nested value, as short as it takes to have a meaning: box.position.x is position_x, box.length length.
 
-    What is said of the vehicle (ego) keeps its whole name, and x its owner's.
+    What is said of the vehicle (ego) keeps its whole name, and x its owner's. Nested values of a frame with a list are
+    none of its objects: the speed of `vehicle` is not theirs.
     """
     shortest = len(path) - (1 if len(path[-1]) > 1 else 2)
     names = ["_".join(path[start:]) for start in range(1 if path[0].startswith("ego") else shortest + 1)]
-    return next((name for name in names if meaning(name) is not None), "_".join(path))
+    if not of_frame or len(path) == 1:
+        return next((name for name in names if meaning(name) is not None), "_".join(path))
+    known = (name for name in names if (found := meaning(name)) is not None and found[0] in OF_FRAMES)
+    return next(known, "_".join(("frame", *path)))
 
 
 def _parts(

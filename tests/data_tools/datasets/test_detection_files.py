@@ -133,17 +133,20 @@ def test_csv_and_ndjson_agree(tmp_path_factory, table):
 
 
 def test_nested_values_have_the_names_of_columns(tmp_path):
-    """A vector has x, y and z, a quaternion in a list is none; what is said of the vehicle is not the object's."""
+    """A vector has x, y and z, a quaternion in a list is none; a frame's vehicle and sensor are not the object."""
     frame = {
         "header": {"stamp": {"sec": 1, "nanosec": 250_000_000}},
         "ego": {"x": 5.0, "y": 6.0, "yaw": 0.0},
+        "platform": {"position": [0, 0], "size": {"length": 9}, "velocity": [8, 8]},
         "objects": [
             {"class": "car", "pose": {"position": [1, 2, 3], "yaw": 0.5}, "velocity": [4, 5], "rotation": [1, 0, 0, 0]}
         ],
     }
-    scene = read_detections(write(tmp_path, ".ndjson", json.dumps(frame))).scene("drive")
+    empty = frame | {"header": {"stamp": {"sec": 2, "nanosec": 0}}, "objects": []}
+    lines = f"{json.dumps(frame)}\n{json.dumps(empty)}\n"
+    scene = read_detections(write(tmp_path, ".ndjson", lines)).scene("drive")
     boxes = scene.frames[0].detections.boxes
-    assert scene.frames[0].timestamp == 1.25
+    assert [(each.timestamp, len(each)) for each in scene.frames] == [(1.25, 1), (2.0, 0)]
     assert (boxes.label.tolist(), boxes.position.tolist(), boxes.yaw.tolist()) == (["car"], [[1, 2, 3]], [0.5])
     assert (boxes.velocity.tolist(), np.isnan(boxes.size).all()) == ([[4, 5]], True)
     assert scene.world_T_ego[0, :2, 3].tolist() == [5, 6]
