@@ -282,9 +282,8 @@ def _plain_values(
             continue
         if value and isinstance(value, list) and len(value) <= 3:
             value = dict(zip("xyz", value, strict=False))
-        if isinstance(value, dict) and tuple(sorted(value)) in STAMPS and all(map(_is_whole, value.values())):
-            nanoseconds, seconds = (value[part] for part in sorted(value))
-            plain[_joined(path, of_frame)] = seconds + 1e-9 * nanoseconds
+        if isinstance(value, dict) and tuple(sorted(value)) in STAMPS:
+            plain[_joined(path, of_frame)] = _seconds(value)
         elif value and isinstance(value, dict) and len(path) < DEEPEST:
             deeper = _plain_values(path, value, of_frame)
             plain |= deeper[0]
@@ -294,8 +293,11 @@ def _plain_values(
     return plain, lists
 
 
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, int) and abs(value) <= LATEST
+def _seconds(stamp: dict[str, Any]) -> Any:
+    """Time in s of whole seconds and nanoseconds; what is none stays as it is."""
+    nanoseconds, seconds = (stamp[part] for part in sorted(stamp))
+    whole = all(isinstance(part, int) and abs(part) <= LATEST for part in (nanoseconds, seconds))
+    return seconds + 1e-9 * nanoseconds if whole else stamp
 
 
 @lru_cache(1024)

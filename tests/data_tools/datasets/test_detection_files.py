@@ -273,6 +273,7 @@ BROKEN_NDJSON = [
     (FIRST + '{"timestamp": 1, "x": 1' + "0" * 400 + ', "y": 1}', "line 2: x: expected a finite number, got inf"),
     (FIRST + "[" * 100_000, "line 2: broken or truncated JSON"),
     ('{"t": 0, "a": [{"x": 1}], "b": [{"x": 1}]}', "line 1: expected one list of objects, got a, b"),
+    ('{"t": {"sec": "1", "nanosec": 2}, "x": 1, "y": 2}', "line 1: timestamp (column 't'): expected a number, got"),
     ('{"t": 0, "a": [{"parts": [{"x": 1}]}]}', "line 1: parts: expected no list of objects in an object"),
     ('{"a": ' * 900 + "1" + "}" * 900, "expected a column 'timestamp' and a column 'x' and a column 'y'"),
     ("", "expected at least one row"),
