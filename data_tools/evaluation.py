@@ -37,6 +37,7 @@ from data_tools.metrics import (
     errors_by_class,
     hota_metrics,
     label_errors,
+    match_scene,
     placed_detections,
     scene_metrics_by_label,
     score_sweep,
@@ -45,7 +46,7 @@ from data_tools.metrics.hota import Similarity
 from saga_fg.errors import InputError
 from saga_fg.numerics import FloatArray, IntArray, StrArray
 from saga_fg.parts import new_part, of_own_code, part_kind
-from saga_fg.types import Scene, html_table, text_table
+from saga_fg.types import Annotations, Scene, html_table, text_table
 
 __all__ = [
     "Evaluation",
@@ -414,6 +415,14 @@ class Evaluation:
         return [*recall_charts(self.curves), *accuracy_charts(self.errors)]
 
 
+def beside_hidden(truth: Sequence[Annotations], found: SceneBoxes) -> SceneBoxes:
+    """The boxes found of a scene but those of hidden objects, which are neither right nor wrong."""
+    kept, first = np.ones(len(found), dtype=np.bool_), np.searchsorted(found.frame, np.arange(len(truth)))
+    for begin, now, match in zip(first, truth, match_scene(truth, found.by_frame(len(truth))), strict=True):
+        kept[begin + match.track_row[~now.visible[match.object_row]]] = False
+    return found.select(kept)
+
+
 def evaluate_tracks(
     results: Sequence[tuple[Scene, SceneBoxes]],
     with_hota: bool = False,
@@ -430,7 +439,7 @@ def evaluate_tracks(
     Raises `InputError` for a scene without ground truth, `MissingExtraError` for HOTA without trackeval.
     """
     by_label: dict[str, list[SceneMetrics]] = {}
-    errors, pairs = [], []
+    errors, pairs, judged = [], [], []
     for scene, found in results:
         if scene.ground_truth is None:
             raise InputError(f"scene {scene.name}: expected ground truth")
@@ -440,9 +449,10 @@ def evaluate_tracks(
         errors.append(
             label_errors(visible, found, visible.boxes.velocity, placed_detections(scene) if detected else None)
         )
-        pairs.append((SceneBoxes.of_annotations(scene.ground_truth), found))
+        judged.append((scene, beside_hidden(scene.ground_truth, found)))
+        pairs.append((visible, judged[-1][1]))
     pooled = {label: SceneMetrics.pool(parts) for label, parts in sorted(by_label.items())}
-    swept = score_sweep(results) if sweep else None
+    swept = score_sweep(judged) if sweep else None
     thresholds = dict.fromkeys(pooled, 0.0) if swept is None else best_thresholds(swept)
     whole = {"overall": SceneMetrics.pool(pooled.values()), **pooled}
     return Evaluation(

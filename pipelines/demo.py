@@ -148,7 +148,7 @@ def merge_lines(run: TrackedScene) -> list[str]:
             if name == RELATIONS[1]:
                 text = f"{tracks.timestamp - start:.1f} s: track {source} {name} track {target} (probability {p:.2f})."
                 told.setdefault((source, target), text)
-    return list(told.values())
+    return list(told.values()) or ["Here nobody did."]
 
 
 def hardest_moment(comparison: Comparison) -> tuple[int, int]:

@@ -325,8 +325,8 @@ def merge(
     names = [run.resolve().name for run in runs]
     if len(runs) < 2 or len(set(names)) < len(names):
         raise InputError(f"RUN: expected two folders or more of different names, got {', '.join(names)}")
-    if output.resolve() in [run.resolve() for run in runs]:
-        raise InputError(f"--output {output}: expected another folder than those of the runs, which would lose files")
+    if any(output.resolve() in (run.resolve(), *run.resolve().parents) for run in runs):
+        raise InputError(f"--output {output}: expected another folder than the runs' and those that they are in")
     check_writable_folder(output)
     with progress_bar(unit="drives") as progress:
         merged = merge_sessions([read_session(run) for run in runs], progress)

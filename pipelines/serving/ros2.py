@@ -62,6 +62,7 @@ def open_network(wanted: Mapping[str, Collection[str]], middleware: Middleware |
 PATIENCE = 0.5  # s
 _TOPIC = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 POLL = 0.05  # s between looks at the clock
+UNHEARD = 5.0  # s, after which topics that nobody publishes are named
 DETECTION_TYPES = tuple(OBJECT_TYPES)
 RESULT_TYPES = {name.partition("/")[2]: name for name in RESULTS}
 TRANSFORMS = {"/tf": ("tf2_msgs/TFMessage",), "/tf_static": ("tf2_msgs/TFMessage",)}
@@ -135,8 +136,13 @@ class Ros2Node:
         """Track until `stop` is requested; what was received by then is tracked."""
         stopped: list[bool] = []
         stop.notify(partial(stopped.append, True))
+        begin, silent = time.monotonic(), set(self._sensor_of)
         while not stopped:
             payloads = self._network.received(POLL)
+            if silent and time.monotonic() > begin + UNHEARD:
+                for topic in sorted(silent - set(self._network.subscribed)):
+                    log.warning("%s: nobody publishes this topic so far", topic)
+                silent.clear()
             self._open_results()
             self.take(payloads)
         self.take(self._network.received(0.0), patience=0.0)

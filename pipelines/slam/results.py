@@ -190,10 +190,11 @@ def _grid(log: LaserLog, path: LaserPath, poses: FloatArray, largest_range: floa
 
 
 # all that a run may write, also in a map of an earlier one: a folder holds the files of its last run
+_MAP_FILES = ("map.ply", "map/submaps.csv", "map/origin.csv", "map/[0-9]*.ply", "map/[0-9]*.pcd", "graph.g2o")
 LIDAR_FILES = (
     *("trajectory.txt", "times.txt", "trajectory.tum", "odometry.tum", "online.tum", "reference.tum"),
-    *("map.ply", "map/submaps.csv", "map/origin.csv", "map/[0-9]*.ply", "map/[0-9]*.pcd"),
-    *("graph.g2o", "observations.csv", "landmarks.json", "landmarks.csv"),
+    *_MAP_FILES,
+    *("observations.csv", "landmarks.json", "landmarks.csv"),
     *("covariances.csv", "tracks.csv", "above.png", "metrics.json"),
 )
 _GAP = 2.0  # m between observed spans of a wall, beyond which two pieces of it are drawn
@@ -404,7 +405,7 @@ def write_localised(output: Path, found: LocalisedDrive, scans: ScanSequence, sl
     return figures
 
 
-MERGED_FILES = ("paths/*.tum", "map.ply", *LIDAR_FILES[7:10], "graph.g2o", "above.png", "metrics.json")
+MERGED_FILES = ("paths/*.tum", *_MAP_FILES, "above.png", "metrics.json")
 
 
 def write_merged(output: Path, merged: MergedDrives, spacing: float) -> dict[str, Any]:

@@ -150,6 +150,27 @@ def comparison() -> Comparison:
     return compare(SimulatedTraffic(SHORT, scenes=2, seed=1), load_config("simulated"), METHODS)
 
 
+def test_a_track_on_a_hidden_object_is_neither_right_nor_wrong(tmp_path):
+    """One car is seen all the time, the other is hidden from the fifth moment on; a ghost stands apart."""
+    names = np.array(["a", "b"])
+    truth, tracks = ["timestamp,id,label,x,y,visible"], ["timestamp,id,label,x,y,score"]
+    for k in range(10):
+        for name, y in zip(names, (0, 20), strict=True):
+            truth.append(f"{k},{name},car,{8 * k},{y},{int(name == 'a' or k < 5)}")
+            tracks.append(f"{k},{name},car,{8 * k},{y},0.9")
+    files = [tmp_path / f"{name}.csv" for name in ("tracks", "truth")]
+    for ghost, wrong in ((False, 0), (True, 10)):
+        rows = [*tracks, *(f"{k},ghost,car,{8 * k},60,0.9" for k in range(10) if ghost)]
+        files[0].write_text("\n".join(rows) + "\n")
+        files[1].write_text("\n".join(truth) + "\n")
+        done("evaluate", "file", files[0], "--truth", files[1], "--hota", "--json", tmp_path / "figures.json")
+        figures = json.loads((tmp_path / "figures.json").read_text())
+        hota = figures["hota"]["car"]["centre"]
+        assert (hota["fp"], hota["fn"], hota["ids"]) == (wrong, 0, 0)
+        assert hota["hota"] == pytest.approx(1.0) if not ghost else hota["hota"] < 1
+        assert figures["sweep"]["car"]["fp"] == wrong
+
+
 def test_all_methods_see_the_same_scenes(comparison):
     assert tuple(comparison.runs) == METHODS
     assert len({tuple(run.scene.name for run in runs) for runs in comparison.runs.values()}) == 1

@@ -236,6 +236,22 @@ def test_what_cannot_be_used_is_one_line_and_the_node_goes_on(monkeypatch, caplo
     assert len(node.sent) == 1
 
 
+def test_a_topic_that_nobody_publishes_is_named_once(monkeypatch, caplog):
+    node = Published(monkeypatch).node
+    monkeypatch.setattr("pipelines.serving.ros2.UNHEARD", 0.0)
+    stops, looks = [], []
+
+    def received(network, timeout):
+        looks.append(timeout)
+        if len(looks) == 3:
+            stops[0]()
+        return []
+
+    monkeypatch.setattr(DdsNetwork, "received", received)
+    node.run(SimpleNamespace(notify=stops.append))
+    assert [line for line in caplog.messages if "nobody" in line] == ["/objects: nobody publishes this topic so far"]
+
+
 def test_names_that_are_no_topics(monkeypatch):
     for name in ("tracks", "/a b", "/1", "//a", "/a/"):
         with pytest.raises(InputError, match=f"'{name}': expected a topic of letters, digits and _ after slashes"):
