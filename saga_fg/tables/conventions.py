@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 
@@ -176,14 +176,15 @@ def velocities_between_frames(time: FloatArray, label: StrArray, position: Float
     return found
 
 
-def headings_in_degrees(yaw: FloatArray) -> Finding | None:
-    """Headings (n,), as they were given, of which many are beyond a full turn of 2 pi."""
+def headings_in_degrees(yaw: FloatArray, column: Literal["angle", "ego_yaw"] = "angle") -> Finding | None:
+    """Headings (n,) as they were given, of which many are beyond a full turn of 2 pi; column: of all, or of the vehicle."""
     known = np.abs(yaw[np.isfinite(yaw)])
     beyond = share(known > 2 * np.pi + 0.1)
     if len(known) < FEWEST or beyond < 0.05:
         return None
-    what = f"headings look like degrees: {beyond:.0%} of them are beyond 2 pi, the largest is {known.max():.4g}"
-    return Finding("degrees", what, "expected rad", Mend(units={"angle": "deg"}))
+    whose = "headings" if column == "angle" else "headings of the vehicle"
+    what = f"{whose} look like degrees: {beyond:.0%} of them are beyond 2 pi, the largest is {known.max():.4g}"
+    return Finding(f"{column} in degrees", what, "expected rad", Mend(units={column: "deg"}))
 
 
 _CONVENTIONS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
@@ -406,7 +407,8 @@ def findings_of(sample: Sample, logits: Callable[[str], bool] = lambda sensor: F
     found = [scores_beyond_one(sample.score[shares]), sides, *scale]
     if any(scale):
         return [finding for finding in (*found, headings_in_degrees(sample.yaw)) if finding is not None]
-    frame = camera_axes(boxes.position) or frame_taken_for_another(sample)
+    turned = headings_in_degrees(sample.ego_yaw, "ego_yaw")  # places in the world depend on it
+    frame = camera_axes(boxes.position) or turned or frame_taken_for_another(sample)
     if frame is None:
         known = np.isfinite(boxes.velocity).any(axis=1) & (np.hypot(*boxes.velocity.T) > _WALKS)
         motion = np.where(known[:, None], boxes.velocity, sample.own_motion)

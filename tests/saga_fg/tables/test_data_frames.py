@@ -112,6 +112,19 @@ def test_tables_are_read_as_the_arguments_say():
     pd.testing.assert_frame_equal(found[["x", "y", "yaw"]], plain[["x", "y", "yaw"]], rtol=1e-6, atol=1e-9)
 
 
+def test_a_vehicle_in_degrees_is_not_taken_for_one_of_other_coordinates():
+    """A vehicle that turns sees parked cars; its heading alone is in degrees."""
+    time = np.repeat(0.2 * np.arange(30), 3)
+    yaw, place = 0.05 * time, np.column_stack([6.0 * time, 0.15 * time**2])
+    cars = np.tile([[10.0, 6.0], [30.0, -5.0], [55.0, 12.0]], (30, 1)) - place
+    ahead = np.cos(yaw) * cars[:, 0] + np.sin(yaw) * cars[:, 1]
+    left = np.cos(yaw) * cars[:, 1] - np.sin(yaw) * cars[:, 0]
+    rows = {"timestamp": time, "x": ahead, "y": left, "label": "car", "ego_x": place[:, 0], "ego_y": place[:, 1]}
+    rows = pd.DataFrame({**rows, "ego_yaw": np.degrees(yaw + 1.0)})
+    with pytest.raises(InputError, match=r"headings of the vehicle look like degrees.*'ego_yaw': 'deg'"):
+        saga_fg.track(rows, how=TableImport(coordinates="ego"))
+
+
 def test_a_table_is_tracked_in_one_line():
     tracks = saga_fg.track(table(label="car"))
     assert sorted(tracks.id.unique()) == [1, 2]

@@ -53,6 +53,8 @@ def test_headings_in_degrees(subtests):
     ]:
         with subtests.test(yaw=yaw, found=found):
             assert option(headings_in_degrees(yaw)) == found
+            of_vehicle = found and found.replace("angle", "ego_yaw")
+            assert option(headings_in_degrees(yaw, "ego_yaw")) == of_vehicle
 
 
 def test_headings_against_motion(subtests):
