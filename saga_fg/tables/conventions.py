@@ -177,7 +177,7 @@ def velocities_between_frames(time: FloatArray, label: StrArray, position: Float
 
 
 def headings_in_degrees(yaw: FloatArray, column: Literal["angle", "ego_yaw"] = "angle") -> Finding | None:
-    """Headings (n,) as they were given, of which many are beyond a full turn of 2 pi; column: of all, or of the vehicle."""
+    """Headings (n,) as they were given, many of them beyond a full turn of 2 pi; column: of all, or of the vehicle."""
     known = np.abs(yaw[np.isfinite(yaw)])
     beyond = share(known > 2 * np.pi + 0.1)
     if len(known) < FEWEST or beyond < 0.05:

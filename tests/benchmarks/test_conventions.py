@@ -9,6 +9,7 @@ from benchmarks.conventions import KINDS, SPEEDS, TRAPS, table
 from saga_fg import InputError
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.tables.column_names import TableImport
+from saga_fg.tables.column_names import COMMAND
 from saga_fg.tables.detections import raw_table, scenes_of
 from saga_fg.types.dataset import refuse_contradictions
 
@@ -25,7 +26,7 @@ MENDS = {
 
 
 def read(made, how=None):
-    (scene,) = scenes_of(raw_table(made, how))
+    (scene,) = scenes_of(raw_table(made, how, within=COMMAND))
     return scene
 
 

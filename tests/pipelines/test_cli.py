@@ -99,7 +99,7 @@ def test_config_knows_the_settings_of_every_dataset():
 
 def test_what_is_asked_of_the_wrong_command_is_answered_with_the_right_one(tmp_path):
     said = refused("config", "--smoothing", "--for", "heterogeneous")
-    assert said.startswith("error: unknown kind of data for smoothing 'heterogeneous', expected one of: file")
+    assert said.startswith("error: unknown kind of data for smoothing 'heterogeneous', expected one of: dense, file")
     path = tmp_path / "smoothing.yaml"
     path.write_text(saga_fg("config", "--smoothing").stdout)
     said = refused("config", "--config", path)

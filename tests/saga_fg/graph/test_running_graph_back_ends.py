@@ -96,7 +96,8 @@ def test_linear_factors_of_providers_lead_to_one_estimate(seed, name):
         assert kalman.nodes.tolist() == other.nodes.tolist()
         P = kalman.joint_covariance(nodes)
         mean = kalman.joint_mean(nodes)
-        assert np.abs((other.joint_mean(nodes) - mean) / np.sqrt(np.diag(P))).max(initial=0.0) < EXACT
+        off = np.abs((other.joint_mean(nodes) - mean) / np.sqrt(np.diag(P))).max(initial=0.0)
+        assert off < 2 * EXACT  # each may be EXACT off the textbook's
         assert np.linalg.norm(other.joint_covariance(nodes) - P) <= EXACT * np.linalg.norm(P)
     assert told[0].post == pytest.approx(told[1].post, rel=1e-8, abs=1e-9)
     assert np.abs(mean - apart.joint_mean(nodes)).max() > 0.01
