@@ -8,8 +8,7 @@ import pytest
 from benchmarks.conventions import KINDS, SPEEDS, TRAPS, table
 from saga_fg import InputError
 from saga_fg.numerics.geometry import wrap_angle
-from saga_fg.tables.column_names import TableImport
-from saga_fg.tables.column_names import COMMAND
+from saga_fg.tables.column_names import COMMAND, TableImport
 from saga_fg.tables.detections import raw_table, scenes_of
 from saga_fg.types.dataset import refuse_contradictions
 
