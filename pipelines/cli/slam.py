@@ -11,7 +11,7 @@ import typer
 
 from data_tools.files import check_writable_folder
 from data_tools.laser import read_carmen
-from data_tools.lidar import PERIOD, Scan, ScanSequence
+from data_tools.lidar import PERIOD, ScanSequence
 from data_tools.pose_graphs import read_g2o
 from data_tools.recordings import LAYOUTS, RecordingOptions, ScanRecording, is_bag, open_recording, read_bag_laser
 from data_tools.sensor_logs import SensorLog
@@ -20,9 +20,8 @@ from pipelines.cli.console import counted, new_group, progress_bar, working
 from pipelines.cli.options import Config, Verbose, as_command
 from pipelines.slam.configuration import load_slam_config, sensor_log
 from pipelines.slam.drive import Origin, SlamMap, read_map
-from pipelines.slam.driver import Slam, SlamStep
 from pipelines.slam.laser_slam import laser_slam
-from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam, path_tracker, with_objects
+from pipelines.slam.lidar_slam import LidarSlamSettings, Watch, lidar_slam, path_tracker, with_objects
 from pipelines.slam.localisation import LocaliserSettings, localise
 from pipelines.slam.merging import merge_sessions, read_session
 from pipelines.slam.results import (
@@ -32,7 +31,6 @@ from pipelines.slam.results import (
     write_merged,
     write_pose_graph,
 )
-from pipelines.view import RerunViewer, draw_slam_step, load_rerun
 from saga_fg import InputError
 from saga_fg.errors import error_context
 from saga_fg.numerics import IntArray, yaw_transform
@@ -194,6 +192,8 @@ def scans(
     if live and earlier.known_map is not None:
         raise InputError("--view: expected without --map")
     if live:
+        from pipelines.view import load_rerun
+
         load_rerun()
     if drive.detections is not None and not drive.objects:
         raise InputError("--detections: expected with --objects only")
@@ -239,12 +239,7 @@ def scans(
     if slam_map is not None:
         _localise(recording, slam_map, earlier.guess, slam.localisation, output, log)
         return
-    viewer = RerunViewer(output.name, ["slam"]) if live else None
-
-    def watch(slam: Slam, scan: Scan, time: float, step: SlamStep) -> None:
-        if viewer is not None:
-            viewer.draw(draw_slam_step(slam, scan, time, step))
-
+    watch = _opened_viewer(output.name) if live else None
     with progress_bar(unit="scans") as progress:
         lidar = replace(slam.lidar, landmarks=slam.lidar.landmarks and drive.landmarks)
         result = lidar_slam(
@@ -281,6 +276,14 @@ def scans(
         typer.echo(
             f"points without a place: {sum(recording.dropped.values())} in {counted(len(recording.dropped), 'scan')}"
         )
+
+
+def _opened_viewer(name: str) -> Watch:
+    """Rerun's viewer on the screen; returns what draws each scan there."""
+    from pipelines.view import RerunViewer, draw_slam_step
+
+    viewer = RerunViewer(name, ["slam"])
+    return lambda *placed: viewer.draw(draw_slam_step(*placed))
 
 
 def _localise(

@@ -189,7 +189,7 @@ def read_map(folder: str | Path) -> SlamMap:
         raise InputError(
             f"{folder}: expected a map: a folder with submaps.csv and a file of points for each of its lines"
         )
-    table = _rows_below(path, _COLUMNS)
+    table = rows_below(path, _COLUMNS)
     poses, names = transforms(table, Record(3, _COLUMNS[:2], _COLUMNS[2:])), table.values[:, 1].tolist()
     beside = np.array([Path(name).name == name for name in names], dtype=np.bool_)
     table.check(beside, lambda row: f"file: expected a file beside {path.name}, got {names[row][:40]!r}")
@@ -197,7 +197,12 @@ def read_map(folder: str | Path) -> SlamMap:
     return SlamMap(points, poses, _read_origin(folder / "origin.csv"))
 
 
-def _rows_below(path: Path, columns: tuple[str, ...]) -> TextTable:
+def covariance_columns(dim: int) -> list[str]:
+    """Names of the upper triangle of a covariance (dim, dim) in a table."""
+    return [f"P{i + 1}{j + 1}" for i, j in zip(*np.triu_indices(dim), strict=True)]
+
+
+def rows_below(path: Path, columns: tuple[str, ...]) -> TextTable:
     """The rows of a table below the line of its columns. Raises `InputError` for other columns."""
     table = read_table(path, (len(columns),), ",".join(columns), ",")
     if not len(table) or tuple(table.values[0]) != columns:
@@ -208,7 +213,7 @@ def _rows_below(path: Path, columns: tuple[str, ...]) -> TextTable:
 def _read_origin(path: Path) -> Origin | None:
     if not path.is_file():
         return None
-    table = _rows_below(path, _ORIGIN)
+    table = rows_below(path, _ORIGIN)
     if len(table) != 1:
         raise InputError(f"{path}: expected one line of numbers, got {len(table)}")
     latitude, longitude, altitude = table.numbers(slice(0, 3), _ORIGIN, (85.0, 180.0, 1e5))[0].tolist()

@@ -39,6 +39,9 @@ from saga_fg.slam.sensors import sensor_providers
 from saga_fg.slam.submaps import Loops, SubmapSettings
 from saga_fg.types import Frame, Observation
 
+Watch = Callable[[Slam, Scan, float, SlamStep], None]
+"""Told of each scan: the estimate so far, the scan, its time since the first, s, and where it was placed."""
+
 WALL = PlaneLandmark(name="wall")
 POLE = PoleLandmark()
 
@@ -130,15 +133,15 @@ def lidar_slam(
     odometry: Odometry | None = None,
     log: SensorLog | None = None,
     objects: tuple[Sequence[Frame], Tracker] | None = None,
-    watch: Callable[[Slam, Scan, float, SlamStep], None] | None = None,
+    watch: Watch | None = None,
 ) -> SlamResult:
     """Estimate everything from K >= 2 scans of a recording, one after the other. The only pose of the recording that
     counts is the first. Without poses the world is the vehicle's frame at the first
     scan, or that of the fixes by GPS, if there are any: the first scans then tell which way it looks.
 
     providers, detectors, odometry: as of `LidarSlam`; log: of the vehicle's sensors, in the recording's world; objects:
-    frames with detections at the times of all scans, and a new tracker: moving objects leave the scans; watch: called
-    with each scan, its time since the first, s, and where it was placed.
+    frames with detections at the times of all scans, and a new tracker: moving objects leave the scans; watch: is
+    told of each scan.
     Raises `InputError` for a scan without a frame.
     """
     s = settings or LidarSlamSettings()

@@ -18,10 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from data_tools.files import read_table
 from data_tools.pose_graphs import read_g2o
 from data_tools.trajectories import Trajectory, read_tum_poses
-from pipelines.slam.drive import SlamMap, read_map
+from pipelines.slam.drive import SlamMap, covariance_columns, read_map, rows_below
 from pipelines.slam.localisation import KnownMap
 from pipelines.slam.loop_closures import DISTORTION, deviation
 from pipelines.tracking import Progress
@@ -89,9 +88,8 @@ def read_session(folder: str | Path) -> Session:
         if not (folder / name).is_file():
             raise InputError(f"{folder}: expected {name}, as `saga-fg slam scans` writes it")
     slam_map, graph = read_map(folder), read_g2o(folder / "graph.g2o")
-    columns = 22  # a time, and the upper triangle of a covariance
-    table = read_table(folder / "covariances.csv", (columns,), "timestamp,P11,...", ",")
-    times = replace(table, values=table.values[1:], line=table.line[1:]).numbers([0], ("timestamp",))[:, 0]
+    table = rows_below(folder / "covariances.csv", ("timestamp", *covariance_columns(6)))
+    times = table.numbers([0], ("timestamp",))[:, 0]
     if (np.diff(times) <= 0).any():
         raise InputError(f"{folder / 'covariances.csv'}: timestamp: expected increasing times")
     if len(times) != len(graph):
@@ -113,8 +111,8 @@ def _joined(merged: MergedDrives, session: Session) -> MergedDrives:
     offset = len(merged.graph)
     map_T_session, found = _loops(merged, session)
     a, b = merged.graph, session.graph
-    loops = [*merged.loops, *(replace(one, second=one.second + offset) for one in found)]
-    between = [one for one in loops if one.second >= offset]
+    between = [replace(one, second=one.second + offset) for one in found]  # those before are among a's measurements
+    loops = [*merged.loops, *between]
     graph = PoseGraph(
         np.arange(offset + len(b)),
         np.concatenate([a.world_T_pose, map_T_session @ b.world_T_pose]),

@@ -61,7 +61,7 @@ from data_tools.laser import LaserLog, OccupancyGrid
 from data_tools.lidar import ScanSequence, write_cloud
 from data_tools.pose_graphs import write_g2o
 from data_tools.trajectories import Trajectory, trajectory_errors, write_kitti_poses, write_tum_poses
-from pipelines.slam.drive import Origin, SlamMap, placed_clouds, write_map
+from pipelines.slam.drive import Origin, SlamMap, covariance_columns, placed_clouds, write_map
 from pipelines.slam.driver import SlamResult
 from pipelines.slam.laser_slam import LaserPath
 from pipelines.slam.lidar_slam import WALL, LidarSlamSettings
@@ -89,7 +89,7 @@ def write_covariances(
 ) -> None:
     """Write covariances.csv: the covariance (N, k, k) of each pose, its name in column `key`; other columns follow."""
     upper = np.triu_indices(covariances.shape[1])
-    rows = [",".join([key, *columns, *(f"P{i + 1}{j + 1}" for i, j in zip(*upper, strict=True))])]
+    rows = [",".join([key, *columns, *covariance_columns(covariances.shape[1])])]
     for *entries, covariance in zip(names, *columns.values(), covariances, strict=True):
         rows.append(",".join([*map(str, entries), *(f"{x:.9g}" for x in covariance[upper])]))
     write_text(path, "\n".join(rows) + "\n")

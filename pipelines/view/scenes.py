@@ -34,12 +34,14 @@ Results of `saga-fg slam scans` as drawings: paths, the map, landmarks with thei
 Metres, about `origin`.
 """
 
+from __future__ import annotations
+
 import heapq
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -51,9 +53,11 @@ from data_tools.metrics import SceneBoxes
 from data_tools.trajectories import Trajectory, read_tum_poses
 from pipelines.report.page import result_scenes
 from pipelines.report.scenes import UNMEASURED, Edges, ReportScene, edges_of_frames, latest_detections
-from pipelines.slam.driver import Slam, SlamStep
 from saga_fg import Boxes, InputError
 from saga_fg.numerics import FloatArray, IntArray, checked
+
+if TYPE_CHECKING:
+    from pipelines.slam.driver import Slam, SlamStep
 
 VEHICLE = (4.6, 1.9, 1.6)  # length, width, height of the box drawn for the vehicle, m
 Colour = tuple[int, int, int]
