@@ -252,28 +252,29 @@ def _json_rows(path: Path, file: TextIO) -> Iterator[tuple[int, dict[str, Any]]]
         if not any(isinstance(value, dict | list) for value in row.values()):
             yield number, row
             continue
-        common, lists = _plain_values((), row)
+        common, lists = _flattened((), row)
         filled = {name: entries for name, entries in lists.items() if entries}
         if len(filled) > 1:
             raise InputError(f"{path}: line {number}: expected one list of objects, got {', '.join(sorted(filled))}")
         names |= filled.keys()
-        if not names.isdisjoint(lists):
-            common, _ = _plain_values((), row, of_frame=True)
+        shared = _named(common, of_frame=not names.isdisjoint(lists))
         for entry in next(iter(filled.values()), [{}]):
-            own, deeper = _plain_values((), entry)
+            own, deeper = _flattened((), entry)
             if any(deeper.values()):
                 raise InputError(f"{path}: line {number}: {min(deeper)}: expected no list of objects in an object")
-            yield number, {**common, **own}
+            yield number, {**shared, **_named(own)}
 
 
-def _plain_values(
-    within: tuple[str, ...], values: Mapping[str, Any], of_frame: bool = False
-) -> tuple[dict[str, Any], dict[str, list[dict[str, Any]]]]:
-    """The values of a JSON object by their names in a table, and its lists of objects.
+Nested = dict[tuple[str, ...], Any]
+"""Values of a JSON object by the names on the way to each."""
+
+
+def _flattened(within: tuple[str, ...], values: Mapping[str, Any]) -> tuple[Nested, dict[str, list[dict[str, Any]]]]:
+    """The values of a JSON object, and its lists of objects.
 
     A list of up to three has x, y and z; seconds and nanoseconds are one time, s.
     """
-    plain: dict[str, Any] = {}
+    plain: Nested = {}
     lists: dict[str, list[dict[str, Any]]] = {}
     for key, value in values.items():
         path = (*within, key)
@@ -283,14 +284,19 @@ def _plain_values(
         if value and isinstance(value, list) and len(value) <= 3:
             value = dict(zip("xyz", value, strict=False))
         if isinstance(value, dict) and tuple(sorted(value)) in STAMPS:
-            plain[_joined(path, of_frame)] = _seconds(value)
+            plain[path] = _seconds(value)
         elif value and isinstance(value, dict) and len(path) < DEEPEST:
-            deeper = _plain_values(path, value, of_frame)
+            deeper = _flattened(path, value)
             plain |= deeper[0]
             lists |= deeper[1]
         else:
-            plain[_joined(path, of_frame)] = value
+            plain[path] = value
     return plain, lists
+
+
+def _named(values: Nested, of_frame: bool = False) -> dict[str, Any]:
+    """Values by their names in a table; of two of one name the last."""
+    return {_joined(path, of_frame): value for path, value in values.items()}
 
 
 def _seconds(stamp: dict[str, Any]) -> Any:
