@@ -417,6 +417,8 @@ class Evaluation:
 
 def beside_hidden(truth: Sequence[Annotations], found: SceneBoxes) -> SceneBoxes:
     """The boxes found of a scene but those of hidden objects, which are neither right nor wrong."""
+    if all(now.visible.all() for now in truth):
+        return found
     kept, first = np.ones(len(found), dtype=np.bool_), np.searchsorted(found.frame, np.arange(len(truth)))
     for begin, now, match in zip(first, truth, match_scene(truth, found.by_frame(len(truth))), strict=True):
         kept[begin + match.track_row[~now.visible[match.object_row]]] = False
