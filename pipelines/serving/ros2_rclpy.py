@@ -83,7 +83,7 @@ class RclpyNetwork(Ros2Network):
 
 
 def _installed(topic: str, types: Collection[str]) -> list[str]:
-    """Those of the types of a topic whose packages are installed."""
+    """The types of a topic whose message packages are installed."""
     found, lacking = [], {}
     for type_ in types:
         try:

@@ -149,9 +149,10 @@ class LabelModel:
     providers: Sequence[FactorProvider] = ()
     corrections: Sequence[Correction] = ()
 
-    def __post_init__(self) -> None:
-        if not self.smoothing.edges:
-            vars(self)["tracker"] = replace(self.tracker, edges=())
+    @cached_property
+    def offline(self) -> TrackerSettings:
+        """Settings of the tracker in the passes: without edges where `smoothing` has none."""
+        return self.tracker if self.smoothing.edges else replace(self.tracker, edges=())
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,7 +283,7 @@ class LabelBuilder:
             evidence = gather_evidence(frames, wanted, sensors, model.tracker.classes)
             if len(evidence.times):
                 track_of = np.concatenate([np.empty(0, dtype=np.int64), *(each.track_of for each in tracked)])
-                objects = smooth_objects(evidence, track_of, model.smoothing, model.tracker, model.providers)
+                objects = smooth_objects(evidence, track_of, model.smoothing, model.offline, model.providers)
                 if self._chunks is WHOLE:
                     self._whole = evidence, objects, wanted
                 self._label(begin, end, evidence, objects, wanted)
@@ -295,7 +296,7 @@ class LabelBuilder:
         near = evidence.times[[0, -1]] + [-LATE, LATE]
         given = [(k, one) for k, one in enumerate(model.corrections) if near[0] <= one.at.time <= near[1]]
         if given:
-            found = correct_objects(evidence, objects, given, model.smoothing, model.tracker, model.providers)
+            found = correct_objects(evidence, objects, given, model.smoothing, model.offline, model.providers)
             evidence, objects, whole = found.evidence, found.objects, found.whole
             for number, one in given:
                 if begin <= one.at.time < end or number not in self._outcome:

@@ -118,7 +118,7 @@ class RightOfWay:
         return found
 
     def relations(self, ids: IntArray) -> Relations:
-        """What is told of the tracks `ids` (n,)."""
+        """Relations between the tracks `ids` (n,) that are probable enough to be told."""
         told = [
             (*pair, name, p)
             for pair, each in self.probability.items()

@@ -43,7 +43,7 @@ from factors import (
     relative_factors,
 )
 from saga_fg.errors import InputError
-from saga_fg.estimators import GraphSolution, Interactions
+from saga_fg.estimators import Interactions
 from saga_fg.graph import (
     EGO_ERROR,
     EGO_POSE,
@@ -217,7 +217,7 @@ class JointEstimate:
     errors: FloatArray
     objects: tuple[ObjectStates, ...]
     converged: bool
-    solution: Solution | GraphSolution
+    solution: Solution
     _record: Record
 
     @cached_property
@@ -247,9 +247,7 @@ class JointEstimate:
         return np.asarray(np.sqrt(np.diagonal(P, axis1=1, axis2=2).mean(axis=0)))
 
 
-def read_estimate(
-    record: Record, solution: Solution | GraphSolution, stationary: Sequence[FloatArray]
-) -> JointEstimate:
+def read_estimate(record: Record, solution: Solution, stationary: Sequence[FloatArray]) -> JointEstimate:
     """The estimate at the epochs of a record; stationary: probabilities (n,) of the objects of each."""
     values = solution.values
     return JointEstimate(
