@@ -30,9 +30,6 @@ class StreamSettings(Settings):
     max_sensors: PositiveInt = setting(
         1000, "largest number of sensors whose frames are numbered; beyond it the longest silent one is forgotten"
     )
-    max_seq_jump: PositiveInt = setting(
-        1_000_000, "largest step of `seq` of one sensor; a frame further ahead is refused, unless it is the first"
-    )
     max_detections: PositiveInt = setting(
         500, "largest number of detections of a frame; 500 take up to 0.2 s, for which all clients wait"
     )

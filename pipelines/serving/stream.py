@@ -38,6 +38,7 @@ from saga_fg.tracking import GreedyTracker, SensorTime
 from saga_fg.types import Tracks
 
 Known = Literal["taken", "unconfirmed"]
+_MAX_SEQ_JUMP = 1_000_000  # of one sensor: a number further ahead is damaged, and would refuse all later ones
 
 
 class Numbering:
@@ -367,8 +368,8 @@ class StreamTracker(Generic[Client]):
         timestamp, sensor, number = message.frame.timestamp, message.frame.sensor, message.seq
         if number is not None:
             last = self._numbering.last.get(sensor)
-            if last is not None and number > last + self.settings.max_seq_jump:
-                most = last + self.settings.max_seq_jump
+            if last is not None and number > last + _MAX_SEQ_JUMP:
+                most = last + _MAX_SEQ_JUMP
                 raise InputError(f"seq: expected at most {most} after {last}, the last one of {sensor!r}, got {number}")
             known = self._numbering.known(sensor, number)
             if known is not None:

@@ -108,6 +108,7 @@ class OdometryIncrements:
         return np.stack(list(accumulate(self.a_T_b, np.matmul, initial=first)))
 
 
+STATIONARY_WINDOW = 3.0  # s, over which an object is judged stationary or moving; longer is surer, and later
 MAX_ITERATIONS = 30  # largest number of linearisations in each pass
 KEYFRAME_PERIOD = 0.15  # skip frames that follow a keyframe within this time, s
 
@@ -117,9 +118,6 @@ class JointSettings(Settings):
     """Noise of the odometry, stationarity of objects, and effort of the joint estimation."""
 
     odometry: OdometryNoise = settings_group(OdometryNoise, "errors of the odometry")
-    stationary_window: Positive = setting(
-        3.0, "time over which an object is judged stationary or moving, s; higher: surer, later"
-    )
     moving_speed: Mapping[str, Positive] = settings_group(
         lambda: {DEFAULT: 5.0, "pedestrian": 1.0},
         "standard deviation of the velocity of moving objects by class, m/s; default serves all others",
@@ -320,7 +318,7 @@ def stationary_probabilities(
     0 where there are too few detections. Between two detections it is the smaller one of theirs.
     """
     seen = _place(record, path, settings)
-    p = _probabilities(seen, slow, settings)
+    p = _probabilities(seen, slow)
     result = [np.zeros(len(now.objects.id)) for now in record]
     if not len(p):
         return result
@@ -336,21 +334,21 @@ def stationary_probabilities(
     return result
 
 
-def _probabilities(seen: _PlacedDetections, slow: FloatArray, settings: JointSettings) -> FloatArray:
+def _probabilities(seen: _PlacedDetections, slow: FloatArray) -> FloatArray:
     """P(stationary) (N,) of the object of each detection, around it."""
     n = len(seen.object)
     if n == 0:
         return np.empty(0)
-    far = 4 * (seen.time.max() - seen.time.min() + settings.stationary_window)  # puts objects apart on one axis
+    far = 4 * (seen.time.max() - seen.time.min() + STATIONARY_WINDOW)  # puts objects apart on one axis
     axis = seen.time - seen.time.min() + far * np.unique(seen.object, return_inverse=True)[1]
-    low = np.searchsorted(axis, axis - settings.stationary_window / 2, "left")
-    high = np.searchsorted(axis, axis + settings.stationary_window / 2, "right")
+    low = np.searchsorted(axis, axis - STATIONARY_WINDOW / 2, "left")
+    high = np.searchsorted(axis, axis + STATIONARY_WINDOW / 2, "right")
     start = np.searchsorted(seen.object, seen.object, "left")
     end = np.searchsorted(seen.object, seen.object, "right")
     # at the ends of its lifespan the window is shifted into it
-    low = np.where(high == end, np.searchsorted(axis, axis[end - 1] - settings.stationary_window, "left"), low)
+    low = np.where(high == end, np.searchsorted(axis, axis[end - 1] - STATIONARY_WINDOW, "left"), low)
     low = np.maximum(low, start)
-    high = np.where(low == start, np.searchsorted(axis, axis[start] + settings.stationary_window, "right"), high)
+    high = np.where(low == start, np.searchsorted(axis, axis[start] + STATIONARY_WINDOW, "right"), high)
     high = np.minimum(high, end)
     middle = (low + high) // 2
     n1, n2 = middle - low, high - middle
