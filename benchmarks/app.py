@@ -8,7 +8,7 @@ from benchmarks.runner import application
 
 NAMES = (
     *("calibration", "conventions", "endurance", "gaps", "geometry", "inertial", "joint", "kills", "labels"),
-    *("landmarks", "loops", "metrics", "pose_graphs", "right_of_way", "scaling", "service", "slam", "speed"),
+    *("landmarks", "loops", "metrics", "pose_graphs", "right_of_way", "service", "slam", "speed"),
     *("streaming", "tracking"),
 )
 

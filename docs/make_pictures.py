@@ -18,7 +18,6 @@ from crossing_picture import write_crossing_picture
 from crowd_picture import write_crowd_picture
 from gap_picture import write_gap_picture
 from heterogeneous_picture import write_heterogeneous_picture
-from scaling_picture import write_scaling_picture
 from slam_loops_picture import write_loops_picture
 
 from benchmarks.joint import degraded_drive, street
@@ -73,7 +72,6 @@ def main() -> None:
     write_concept_pictures(HERE)
     write_crowd_picture(HERE / "crowd.png")
     write_crossing_picture(HERE / "crossing.png")
-    write_scaling_picture(HERE / "scaling.png")
     write_heterogeneous_picture(HERE)
     write_loops_picture(HERE)
     if data := os.environ.get("SAGA_FG_DATA"):

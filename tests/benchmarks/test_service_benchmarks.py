@@ -12,7 +12,6 @@ import pytest
 from benchmarks import kills
 from benchmarks.endurance import EDGES, LONG, NONE, endurance
 from benchmarks.kills import Killed, _damage, _kill, _marked
-from benchmarks.scaling import APART, JOINT, NODES, SEPARATE, JointGraphTracking, SeparateGraphTracking, flock
 from benchmarks.service import clocks
 from benchmarks.service.clocks import ClockFault, fault_rows, offset_figures, offset_shortcomings
 from benchmarks.service.hostile_service import GoodClient, bench_hostile_service, shortcomings
@@ -44,7 +43,6 @@ def test_what_cannot_be_run_is_refused(refused):
     assert "--estimators: unknown name 'kalmann'; did you mean 'kalman'?" in refused(
         "endurance --estimators", "kalmann"
     )
-    assert "--objects: expected whole numbers >= 2" in refused("scaling --objects 1,5")
     assert "--sizes: expected whole numbers >= 1" in refused("speed --sizes", "")
 
 
@@ -188,34 +186,6 @@ def test_memory_is_read_and_the_labels_are_those_of_the_whole(bench):
     assert short["MB at once"] > 0.1
     assert read[-1]["read, s"] == 5.0
     assert whole["peak / first quarter's"] == pytest.approx(read[-1]["most so far, MB"] / read[0]["most so far, MB"])
-
-
-# Node-only filtering beside filters with edge states: the full one agrees exactly
-
-
-def test_with_all_correlations_edges_say_nothing_that_nodes_do_not(bench):
-    """The node-only filter keeps the accuracy: the paper's claim, to the last digits. Two objects, of which one is
-    hidden and the other missed now and then, leave frames that are predictions alone."""
-    found = bench("scaling --objects 2,4,6 --joint-limit 4 --frames 60")
-    rows = {(row["objects"], row["filter"]): row for row in found}
-    for n in (2, 4):
-        assert rows[n, JOINT]["off by, sigma"] < 1e-9
-        assert rows[n, JOINT]["RMSE hidden, m"] == pytest.approx(rows[n, NODES]["RMSE hidden, m"], abs=1e-12)
-        assert rows[n, JOINT]["numbers"] == n * rows[n, NODES]["numbers"]
-    assert {name for n, name in rows if n == 6} == {NODES, SEPARATE, APART}, "beyond the limit"
-    for (n, _), row in rows.items():
-        assert row["/ nodes"] == pytest.approx(row["ms a frame"] / rows[n, NODES]["ms a frame"])
-
-
-def test_edges_of_their_own_are_right_where_nothing_couples_the_nodes():
-    """Without interactions the nodes are independent, and both filters are the classical one."""
-    drawn = flock(3, 15, 0, mixing=0.0)
-    together, apart = JointGraphTracking(drawn), SeparateGraphTracking(drawn)
-    for frame in drawn.frames:
-        for each in (together, apart):
-            each.prepare(frame)()
-    for a, b in zip(together.read(), apart.read(), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-9)
 
 
 # The benchmark of speed: rows with ratios and growth; memory of a frame grows with the number of objects
