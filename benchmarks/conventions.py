@@ -222,7 +222,7 @@ def _command(made: pd.DataFrame) -> list[str]:
         made.to_csv(path, index=False)
         source, settings = DetectionFileSource(detections=[str(path)]), load_config("file")
         with source.open() as dataset:
-            checked = CheckedDataset(dataset, Checks(settings, settings, source.option_for))
+            checked = CheckedDataset(dataset, Checks(settings, settings))
             for name in checked.scenes:
                 checked.scene(name)
     return told

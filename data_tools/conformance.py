@@ -42,8 +42,8 @@ def check_dataset(source: DatasetSource, scenes: int = 2) -> None:
 
 def check_metric(metric: Metric) -> None:
     """Figures of tracks that are right, and of none; they do not depend on the names of the tracks."""
-    moments = [Annotations(np.arange(4).astype(np.str_), boxes(4), np.ones(4, bool)) for _ in range(3)]
-    scene = Scene("scene", np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)), ("",) * 3, (), moments)
+    moments = [Annotations(np.arange(4).astype(np.str_), boxes(4)) for _ in range(3)]
+    scene = Scene("scene", np.arange(3.0), ground_truth=moments)
     right = SceneBoxes.of_annotations(moments)
     kinds = right, replace(right, id=np.char.add("other ", right.id)), right.select(np.arange(0))
     first, renamed, none = (next(iter(own_figures([(scene, found)], [metric]).values())) for found in kinds)

@@ -30,7 +30,7 @@ class Checks:
 
     settings    of the run
     usual       the shipped settings: what a file for --config adds to them should meet something in the data
-    option_for  the options of the command that mend a suspicion, "" for none
+    option_for  the options of the command that mend a suspicion about what no table says, "" for none
     live_plain  whether live frames that look like dense traffic are told, as --like and --config are left out
     """
 

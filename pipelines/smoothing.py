@@ -267,7 +267,7 @@ class _Spooled:
     def __iter__(self) -> Iterator[tuple[Scene, tuple[Labels, ...]]]:
         for part in self.labels:
             times = np.array([moment.tracks.timestamp for moment in part])
-            yield Scene(self.name, times, np.tile(np.eye(4), (len(times), 1, 1)), ("",) * len(times), ()), part
+            yield Scene(self.name, times), part
 
 
 _TABLES = ("labels.csv", "labels.ndjson", "labels.parquet", "review.csv", "corrections.csv", "summary.json", "run.json")

@@ -98,9 +98,9 @@ class EthUcy:
         truth = []
         for number, rows in zip(frames.tolist(), np.split(order, first[1:]), strict=True):
             with error_context(f"{path}: frame {number}"):
-                truth.append(Annotations(person[rows].astype(np.str_), boxes.select(rows), np.ones(len(rows), bool)))
-        poses = np.tile(np.eye(4), (len(frames), 1, 1))
-        return Scene(name, frames / _frame_rate(name, frame), poses, tuple(map(str, frames.tolist())), [], truth)
+                truth.append(Annotations(person[rows].astype(np.str_), boxes.select(rows)))
+        tokens = tuple(map(str, frames.tolist()))
+        return Scene(name, frames / _frame_rate(name, frame), tokens=tokens, ground_truth=truth)
 
 
 def _frame_rate(name: str, frame: IntArray) -> float:

@@ -16,7 +16,7 @@ signal controller, without errors: in the first frame, each second, and when one
 from __future__ import annotations
 
 import zlib
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
@@ -37,7 +37,7 @@ from data_tools.simulator.traffic import SimulatedTrajectories
 from data_tools.simulator.world import scene_from_world
 from saga_fg.errors import InputError, unknown_name
 from saga_fg.numerics import FloatArray, yaw_transform
-from saga_fg.types import MAX_POSITION, Annotations, Boxes, Dataset, Detections, Frame, Scene
+from saga_fg.types import MAX_POSITION, Annotations, Boxes, Detections, Frame, Scene
 
 MAST, ABOVE, VEHICLE = "mast", "above", "vehicle"
 MAST_HEIGHT, ABOVE_HEIGHT = 6.0, 100.0  # m
@@ -84,9 +84,8 @@ def true_scene(traffic: RecordedTraffic) -> Scene:
     vehicles, truth = traffic.vehicles, []
     for time in vehicles.time.tolist():
         boxes, present = vehicles.at(time)
-        truth.append(Annotations(vehicles.id[present], boxes.select(present), np.ones(int(present.sum()), dtype=bool)))
-    poses = np.tile(np.eye(4), (len(traffic), 1, 1))
-    return Scene(traffic.name, np.round(vehicles.time, 6), poses, ("",) * len(traffic), (), truth)
+        truth.append(Annotations(vehicles.id[present], boxes.select(present)))
+    return Scene(traffic.name, np.round(vehicles.time, 6), ground_truth=truth)
 
 
 def _carrier(traffic: RecordedTraffic, viewpoint: str) -> int | None:
@@ -170,20 +169,34 @@ _VIEWPOINT = "Place of the sensors: mast (6 m above the middle), above, vehicle,
 
 
 class TrafficScenes:
-    """The scenes of recorded traffic, each made when it is asked for: with detections, or of ground truth alone."""
+    """The scenes of recorded traffic, each made when it is asked for: with detections, or of ground truth alone.
 
-    def __init__(self, recordings: Recordings, make: Callable[[RecordedTraffic], Scene]) -> None:
-        self.scenes, self._read, self._make = recordings.names, recordings.read, make
+    chosen  names with commas between them, None for all
+    """
+
+    def __init__(
+        self, recordings: Recordings, sense: Callable[[RecordedTraffic], Scene], chosen: str | None = None
+    ) -> None:
+        self.scenes, self._read, self._sense = recordings.names, recordings.read, sense
+        if chosen is not None:
+            self.scenes = ChosenScenes(self, chosen).scenes
 
     def scene(self, name: str) -> Scene:
         """Make one scene; raises `InputError` for an unknown name or a broken record."""
+        return self._sense(self._recording(name))
+
+    def true_scene(self, name: str) -> Scene:
+        """Ground truth of all objects of one scene, without frames; raises as `scene`."""
+        return true_scene(self._recording(name))
+
+    def _recording(self, name: str) -> RecordedTraffic:
         if name not in self.scenes:
             raise InputError(unknown_name("recording", name, self.scenes))
-        return self._make(self._read(name))
+        return self._read(name)
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrafficSource(DatasetSource):
+class TrafficSource(DatasetSource, ABC):
     """Recorded trajectories, and detections made from them by the sensors of the simulator."""
 
     family = "traffic"
@@ -199,18 +212,11 @@ class TrafficSource(DatasetSource):
     def recordings(self) -> AbstractContextManager[Recordings]:
         """The recorded trajectories, for the length of a block."""
 
-    def open(self, truth: bool = False) -> AbstractContextManager[Dataset]:
-        sensed = partial(sensed_scene, viewpoint=self.viewpoint, settings=self.simulator, seed=self.seed)
-        return self._opened(sensed)
-
-    def ground_truth(self) -> AbstractContextManager[Dataset]:
-        return self._opened(true_scene)
-
     @contextmanager
-    def _opened(self, make: Callable[[RecordedTraffic], Scene]) -> Iterator[Dataset]:
+    def open(self, truth: bool = False) -> Iterator[TrafficScenes]:
+        sense = partial(sensed_scene, viewpoint=self.viewpoint, settings=self.simulator, seed=self.seed)
         with self.recordings() as recordings:
-            dataset = TrafficScenes(recordings, make)
-            yield dataset if self.scenes is None else ChosenScenes(dataset, self.scenes)
+            yield TrafficScenes(recordings, sense, self.scenes)
 
 
 @dataclass(frozen=True, kw_only=True)

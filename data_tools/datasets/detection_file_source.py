@@ -38,7 +38,6 @@ from saga_fg.types import Dataset, Scene
 if TYPE_CHECKING:
     from data_tools.evaluation import Evaluation, Metric
     from saga_fg.numerics import FloatArray
-    from saga_fg.types import Mend
 
 JUDGED: tuple[Verb, ...] = ("evaluate", "evaluate labels", "report", "view")
 """Verbs that compare with true objects."""
@@ -194,9 +193,6 @@ class DetectionFileSource(DatasetSource):
             return table_results(rows, result, None, how=self.how)
         with self.open() as dataset:
             return table_results(rows, result, dataset, every_scene=truth, how=self.how, own_times=not truth)
-
-    def option_for(self, mend: Mend) -> str:
-        return self.how.option_for(mend, {})
 
     def kept(self) -> Mapping[str, Any]:
         return self.how.values()

@@ -123,7 +123,7 @@ class MotSequences:
         if lost := len(found.frame) - sum(map(len, frames)):
             log.warning("%s: %d of %d boxes left out: they end above the horizon", boxes, lost, len(found.frame))
         truth = self._annotations(name, count) if self._truth else None
-        return Scene(name, times, np.tile(np.eye(4), (count, 1, 1)), ("",) * count, frames, truth)
+        return Scene(name, times, frames=frames, ground_truth=truth)
 
     def _annotations(self, name: str, count: int) -> list[Annotations]:
         true, moments = self.truth(name), []

@@ -211,7 +211,7 @@ def _scene(rows: TrackRows, name: str) -> Scene:
     times = np.unique(rows.timestamp[mine])
     poses = np.tile(np.eye(4), (len(times), 1, 1))
     poses[:, :2, 3] = np.median(rows.boxes.position[mine, :2], axis=0)
-    return Scene(name, times, poses, ("",) * len(times), ())
+    return Scene(name, times, poses)
 
 
 def scene_result(scene: Scene, rows: TrackRows, path: str | Path) -> SceneResult:

@@ -11,9 +11,12 @@ A new dataset is a dataclass derived from `DatasetSource`, whose fields are its 
         name = "mine"
         folder: str = option("Folder of the recordings, or its URL.")
 
-        @contextmanager
-        def open(self, truth: bool = False) -> Iterator[Dataset]:
-            yield MyRecordings(self.folder, truth)
+        @property
+        def scenes(self) -> tuple[str, ...]:
+            return tuple(sorted(path.stem for path in Path(self.folder).glob("*.json")))
+
+        def scene(self, name: str) -> Scene:
+            return read_recording(Path(self.folder, f"{name}.json"))
 
 Everything else has a default: tables of tracks and labels as results, scored by CLEAR figures and RMSE.
 
@@ -29,12 +32,11 @@ from __future__ import annotations
 
 import hashlib
 import os
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, cast
 
 import numpy as np
 
@@ -48,7 +50,7 @@ if TYPE_CHECKING:
     from data_tools.datasets.results import Results
     from data_tools.lidar import ScanSequence
     from saga_fg.smoothing import Labels
-    from saga_fg.types import Mend, Tracks
+    from saga_fg.types import Tracks
 
 Verb = Literal[
     "track", "smooth", "evaluate", "evaluate labels", "benchmark", "report", "view", "learn noise", "learn interactions"
@@ -304,7 +306,7 @@ class ResultFormat:
 
 @part_kind("dataset", GROUP)
 @dataclass(frozen=True, kw_only=True)
-class DatasetSource(ABC):
+class DatasetSource:
     """Recordings and how to work with them; the fields are the options that name them. Picklable.
 
     name            of the dataset, in `saga-fg VERB NAME`
@@ -330,22 +332,20 @@ class DatasetSource(ABC):
         """Title of the recordings in reports."""
         return self.name
 
-    @abstractmethod
     def open(self, truth: bool = False) -> AbstractContextManager[Dataset]:
-        """The chosen recordings, for the length of a block; with ground truth if there is some and it is wanted."""
+        """The chosen recordings, for the length of a block; with ground truth if there is some and it is wanted.
 
-    def ground_truth(self) -> AbstractContextManager[Dataset]:
-        """The chosen recordings with ground truth of all objects, to learn from it; there may be no frames."""
-        return self.open(truth=True)
+        By default the source is its own dataset, with `scenes` and `scene(name)`. Where a dataset has
+        `true_scene(name)`, it is asked for all objects, seen or not, to learn from them; there may be no frames.
+        """
+        if not hasattr(self, "scene"):
+            raise InputError(f"dataset: {type(self).__name__}: expected scenes and scene(name), or open")
+        return nullcontext(cast(Dataset, self))
 
     def restricted(self, scenes: Collection[str]) -> Self:
         """Recordings of these scenes alone, if `scenes` is an option; a dataset may open more than these."""
         chosen: dict[str, Any] = {each.name: ",".join(scenes) for each in fields(self) if each.name == "scenes"}
         return replace(self, **chosen)
-
-    def option_for(self, mend: Mend) -> str:
-        """The options of the command that mend a suspicion about the recordings; "" where it has none."""
-        return ""
 
     def kept(self) -> Mapping[str, Any]:
         """Options that a result keeps about how its recordings were read: values of JSON."""

@@ -153,7 +153,7 @@ class SceneBoxes(Columns):
 
     def annotations(self, count: int) -> list[Annotations]:
         """The boxes of each of `count` frames as objects that can be seen, to compare others with them."""
-        return [Annotations(each.id, each.boxes, np.ones(len(each), dtype=np.bool_)) for each in self.by_frame(count)]
+        return [Annotations(each.id, each.boxes) for each in self.by_frame(count)]
 
 
 FrameBoxes = tuple[IntArray, Boxes]  # index of the frame (N,), and N boxes

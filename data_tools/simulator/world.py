@@ -215,7 +215,6 @@ def scene_from_world(
         name=name or f"simulated-{seed}",
         timestamps=np.round(date + keyframes, 6),
         world_T_ego=poses,
-        tokens=("",) * len(keyframes),
         frames=tuple(frames),
         ground_truth=annotate(world, keyframes, poses, settings),
     )

@@ -91,7 +91,7 @@ def _require_truth(source: DatasetSource) -> None:
 
 def _tracked(source: DatasetSource, settings: TrackConfig, method: Method) -> tuple[Results, Innovations]:
     """Track all scenes, write the result and read it back; and the innovations of the tracker."""
-    checks = Checks(settings.of_method(method), option_for=source.option_for)
+    checks = Checks(settings.of_method(method))
     recorder = InnovationRecorder()
     with TemporaryDirectory() as folder, source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
         runs = track_dataset(

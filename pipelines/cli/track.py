@@ -175,7 +175,7 @@ def _track(
     if beside.explain and scale.wanted:
         raise InputError("--explain: goes without --workers and --ray")
     kept, horizons = journal_of(output) if beside.explain else None, options.horizons(beside.predict, method)
-    checks = Checks(settings.of_method(method), load_config(family), source.option_for)
+    checks = Checks(settings.of_method(method), load_config(family))
     if scale.wanted:
         checks.see_first(source)
         task = TrackTask(settings, method, source, horizons)
@@ -266,7 +266,7 @@ def _smooth(
     settings = smoothing.for_given_tracks(settings, given)
     record = LabelRun.of_command(source, method, settings, labels.tracks, labels.corrections).record
     usual = smoothing.load_smooth_config(family).tracking
-    checks = Checks(settings.tracking.of_method(method), usual, source.option_for)
+    checks = Checks(settings.tracking.of_method(method), usual)
     if scale.wanted:
         checks.see_first(source)
         task = SmoothTask(settings, method, source, f".{labels.table}", corrections)

@@ -395,8 +395,9 @@ def scenes_to_learn_from(source: DatasetSource, config: TrackConfig, with_truth:
     Raises `InputError` for what cannot be read.
     """
     if with_truth:
-        with source.ground_truth() as dataset:
-            return {name: _detected(dataset.scene(name), config) for name in dataset.scenes}
+        with source.open(truth=True) as dataset:
+            read = getattr(dataset, "true_scene", dataset.scene)
+            return {name: _detected(read(name), config) for name in dataset.scenes}
     with source.open() as dataset:
         scenes = [dataset.scene(name) for name in dataset.scenes]
     return {scene.name: _with_tracks(scene, track_scene(scene, config.new_tracker("kf")).tracks) for scene in scenes}
@@ -411,7 +412,7 @@ def _detected(scene: Scene, config: TrackConfig) -> Scene:
 
 def _with_tracks(scene: Scene, tracks: Sequence[Tracks]) -> Scene:
     seen = [moment.select(moment.coasting == 0) for moment in tracks]
-    truth = [Annotations(each.id.astype(np.str_), each.boxes, np.ones(len(each), dtype=np.bool_)) for each in seen]
+    truth = [Annotations(each.id.astype(np.str_), each.boxes) for each in seen]
     return replace(scene, ground_truth=truth)
 
 

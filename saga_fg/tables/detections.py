@@ -75,10 +75,10 @@ class DetectionTable:
         times, moment = np.unique(self._time[rows], return_inverse=True)
         with error_context(f"{path}: scene {name}"):
             poses = self._poses(rows, moment, len(times))
-            world_T_ego = np.tile(np.eye(4), (len(times), 1, 1)) if poses is None else poses
+            world_T_ego = np.eye(4) if poses is None else poses
             frames, kept, firsts = self._frames(rows, moment, poses)
             findings = self._findings(frames, kept, firsts) if self._judged and name in self.scenes[:JUDGED] else ()
-            return Scene(name, times, world_T_ego, ("",) * len(times), frames, findings=findings)
+            return Scene(name, times, world_T_ego, frames=frames, findings=findings)
 
     def _findings(self, frames: list[Frame], rows: IntArray, firsts: IntArray) -> tuple[Finding, ...]:
         """Findings about the table and a scene; rows (N,): of its detections, firsts (F,): first row of each frame."""

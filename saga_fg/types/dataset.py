@@ -26,19 +26,19 @@ class Annotations:
 
     id       (N,) names of the objects, unique within the moment and constant over the scene
     boxes         label, position, size, yaw, velocity (NaN where unknown)
-    visible  (N,) whether some sensor could see the object; occluded objects are False
+    visible  (N,) whether some sensor could see the object; occluded objects are False; all True if left out
     """
 
     id: StrArray
     boxes: Boxes
-    visible: BoolArray
+    visible: BoolArray = field(default_factory=lambda: np.array(True))
 
     def __post_init__(self) -> None:
         n = len(self.boxes)
         ids = checked_labels("id", self.id, n)
         if len(np.unique(ids)) != n:
             raise InputError("id: expected unique object ids within one moment")
-        visible = np.asarray(self.visible)
+        visible = np.full(n, self.visible) if np.ndim(self.visible) == 0 else np.asarray(self.visible)
         if visible.shape != (n,) or (n and visible.dtype != np.bool_):
             raise InputError(f"visible: expected {n} booleans, got {visible.dtype} {visible.shape}")
         vars(self).update(id=ids, visible=visible.astype(bool))
@@ -53,8 +53,8 @@ class Scene:
 
     name          unique within the dataset
     timestamps    (K,) s, strictly increasing: the moments at which tracks are wanted
-    world_T_ego   (K, 4, 4) pose of the vehicle at these moments
-    tokens        K names the dataset gives to these moments ("" where it has none)
+    world_T_ego   (K, 4, 4) pose of the vehicle at these moments; the identity if left out
+    tokens        K names the dataset gives to these moments, "" where it has none
     frames        of all sensors, in order of time
     ground_truth  K annotations, or None
     findings      what is doubtful about how it was read; None where its reader has not looked
@@ -64,9 +64,9 @@ class Scene:
 
     name: str
     timestamps: FloatArray
-    world_T_ego: FloatArray
-    tokens: tuple[str, ...]
-    frames: Sequence[Frame]
+    world_T_ego: FloatArray = field(default_factory=lambda: np.eye(4))  # a single pose serves all
+    tokens: tuple[str, ...] = ()
+    frames: Sequence[Frame] = ()
     ground_truth: Sequence[Annotations] | None = None
     findings: tuple[Finding, ...] | None = None
 
@@ -79,19 +79,21 @@ class Scene:
             raise InputError(
                 f"scene {self.name}: timestamps[{k}]: expected increasing times, time {what} at {timestamps[k]:.6f} s"
             )
-        poses = checked("world_T_ego", self.world_T_ego, (len(timestamps), 4, 4))
+        K, tokens = len(timestamps), self.tokens or ("",) * len(timestamps)
+        poses = np.tile(self.world_T_ego, (K, 1, 1)) if np.ndim(self.world_T_ego) == 2 else self.world_T_ego
+        poses = checked("world_T_ego", poses, (K, 4, 4))
         for k, pose in enumerate(poses):
             checked_transform(f"scene {self.name}: world_T_ego[{k}]", pose)
-        for name, column in (("tokens", self.tokens), ("ground_truth", self.ground_truth)):
-            if column is not None and len(column) != len(timestamps):
-                raise InputError(f"scene {self.name}: {name}: expected {len(timestamps)} entries, got {len(column)}")
+        for name, column in (("tokens", tokens), ("ground_truth", self.ground_truth)):
+            if column is not None and len(column) != K:
+                raise InputError(f"scene {self.name}: {name}: expected {K} entries, got {len(column)}")
         times = np.array([frame.timestamp for frame in self.frames])
         if (np.diff(times) < 0).any():
             k = int(np.argmax(np.diff(times) < 0)) + 1
             raise InputError(
                 f"scene {self.name}: frames[{k}]: expected frames in order of time, {times[k]:.6f} s comes late"
             )
-        vars(self).update(timestamps=timestamps, world_T_ego=poses)
+        vars(self).update(timestamps=timestamps, world_T_ego=poses, tokens=tokens)
 
     def __len__(self) -> int:
         return len(self.timestamps)

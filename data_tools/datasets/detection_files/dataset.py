@@ -297,7 +297,7 @@ class TruthTable:
         for k, at in enumerate(np.split(np.argsort(moment, kind="stable"), np.cumsum(np.bincount(moment))[:-1])):
             with error_context(f"{self.path}: scene {name}: {times[k]} s"):
                 truth.append(Annotations(self.rows.id[rows][at], boxes.select(at), self._visible[rows][at]))
-        return Scene(name, times, poses, ("",) * len(times), (), truth)
+        return Scene(name, times, poses, ground_truth=truth)
 
 
 def read_truth(path: str | Path, how: TableImport | None = None, within: str = COMMAND) -> TruthTable:

@@ -114,10 +114,11 @@ def test_viewpoints_that_are_none_are_errors(traffic, subtests):
 def test_a_source_opens_chosen_windows(tmp_path):
     write_ngsim(tmp_path, rows() + rows("B"), {"A": crossing(), "B": crossing()})
     source = Ngsim(dataroot=str(tmp_path), scenes="B", road="map")
-    with source.open(truth=True) as dataset, source.ground_truth() as true:
-        assert dataset.scenes == true.scenes == ("B",)
-        scene = dataset.scene("B")
-        assert len(true.scene("B")) == len(scene)
+    with source.open(truth=True) as dataset:
+        assert dataset.scenes == ("B",)
+        scene, true = dataset.scene("B"), dataset.true_scene("B")
+    assert (len(true), len(true.frames)) == (len(scene), 0)
+    assert all(moment.visible.all() for moment in true.ground_truth)
     labels = np.concatenate([frame.detections.boxes.label for frame in scene.frames])
     assert not (np.char.find(labels, "light") >= 0).any()
     assert scene.frames[0].road_map is not None

@@ -211,6 +211,14 @@ def test_a_scene_knows_its_sensors_and_length_even_if_empty():
     assert empty.sensors == ()
 
 
+def test_what_a_scene_leaves_out_is_nowhere_unnamed_and_visible():
+    truth = [dataclasses.replace(annotations(), visible=np.array(True))] * 2
+    plain = Scene("crossing", [0.0, 0.5], ground_truth=truth)
+    np.testing.assert_array_equal(plain.world_T_ego, [np.eye(4)] * 2)
+    assert (plain.tokens, plain.frames) == (("", ""), ())
+    assert Annotations(truth[0].id, truth[0].boxes).visible.all()
+
+
 def test_a_wrong_scene_is_refused(subtests):
     for columns, message in [
         ({"timestamps": [0.0, 0.5, 0.5]}, r"scene crossing: timestamps\[2\]: expected increasing times, time repeats"),
