@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from factors import FactorError
 from factors.validation import (
-    checked,
     checked_key_array,
     checked_key_rows,
     checked_keys,
@@ -22,24 +21,19 @@ TRAPS = {
     "right-hand side of wrong length": "gaussian_factor([1], [I2], np.zeros(3), np.eye(3))",
     "matrix instead of a vector": "prior_factor(1, np.zeros((2, 1)), I2)",
     "covariance of wrong shape": "prior_factor(1, np.zeros(2), np.eye(3))",
-    "covariance of wrong rank": "prior_factor(1, np.zeros(2), np.ones(2))",
     "singular covariance": "prior_factor(1, np.zeros(2), np.zeros((2, 2)))",
-    "indefinite covariance": "prior_factor(1, np.zeros(2), -I2)",
     "nan in a mean": "prior_factor(1, [np.nan, 0.0], I2)",
-    "nan in a covariance": "prior_factor(1, [0.0, 0.0], [[1.0, np.nan], [np.nan, 1.0]])",
     "nan in a nonlinear measurement": "detection_factors([1], Radar(4), [[1.0, np.nan, 0.0]], np.eye(3))",
     "nan in an interaction": "interaction_factor(1, [2], [[[np.nan]]], [0.0], [[1.0]])",
     "empty factor": "gaussian_factor([], [], [])",
-    "factor without rows": "gaussian_factor([1], [np.zeros((0, 2))], np.zeros(0))",
     "factor without columns": "gaussian_factor([1], [np.zeros((2, 0))], np.zeros(2))",
     "no arrays at all": "gaussian_factor([1], [None], ['b'])",
-    "negative key": "prior_factor(-1, [0.0], [[1.0]])",
-    "key beyond 64 bits": "prior_factor(2**64, [0.0], [[1.0]])",
-    "key that is no integer": "prior_factor('x1', [0.0], [[1.0]])",
     "step of wrong blocks": "interaction_factors([9], [1], [0, 1], [I2], [[0, 0, 0]], [np.eye(3)])",
     "step with keys missing": "interaction_factors([9], [1], [0, 2], [I2], [[0, 0]], [I2])",
     "step with rows out of range": "interaction_factors([9], [1], [-1, 0], [I2], [[0, 0]], [I2])",
     "many factors, one covariance missing": "prior_factors([1, 2, 3], np.zeros((3, 2)), [I2, I2])",
+    "interaction with a key missing": "interaction_factor(1, [2, 3], [I2], np.zeros(2), I2)",
+    "joint prior with a mean missing": "joint_prior_factor([1, 2], [np.zeros(2)], I2)",
     "joint prior of wrong size": "joint_prior_factor([1, 2], [np.zeros(2), np.zeros(2)], np.eye(3))",
     "one key in two dimensions": "nonlinear_graph([small, prior_factor(1, [0.0, 0.0], I2)], {1: 2})",
     "one key in two dimensions, linear": "check_dimensions([small, prior_factor(1, [0.0, 0.0], I2)], {1: 1})",
@@ -173,27 +167,6 @@ print(len(frames) > 1, lent, len(repr(frames)) > 0)
     assert run_apart(code) == "True [] True\n"
 
 
-def test_incremental_solver_far_from_zero_is_right(run_apart):
-    """A `LinearContainerFactor` without a linearisation point would be wrong by tens here."""
-    code = """
-    rng = np.random.default_rng(0)
-    isam, everything = gtsam.ISAM2(), []
-    F = np.array([[1.0, 0.5], [0.0, 0.9]])
-    for t in range(6):
-        factors = [prior_factor(0, [50.0, -30.0], np.eye(2))]
-        if t:
-            factors = [interaction_factor(t, [t - 1], [F], [3.0, -4.0], 0.1 * np.eye(2))]
-            factors.append(prior_factor(t, [50.0 + 10 * t, -30.0], np.eye(2)))
-        everything += factors
-        start = gtsam.Values()
-        start.insert(t, 40 * rng.normal(size=2))
-        isam.update(nonlinear_graph(factors, dict.fromkeys(range(6), 2)), start)
-    exact, estimate = gaussian_graph(everything).optimize(), isam.calculateBestEstimate()
-    print(max(np.abs(estimate.atVector(t) - exact.at(t)).max() for t in range(6)) < 1e-9)
-    """
-    assert run_apart(code) == "True\n"
-
-
 # Checks at the door: what is accepted comes out right, what is not is named
 
 
@@ -244,8 +217,3 @@ def test_keys_are_any_of_gtsams_each_once_and_nothing_else(subtests):
     assert [format_key(key) for key in keys] == ["0", "x3", str(2**64 - 1)]
     with pytest.raises(FactorError, match="x1 occurs twice"):
         checked_keys("keys", [gtsam.symbol("x", 1), 2, gtsam.symbol("x", 1)])
-
-
-def test_first_entry_that_is_not_finite_is_named():
-    with pytest.raises(FactorError, match=r"b\[1, 0\]: expected a finite number, got inf"):
-        checked("b", [[1.0, 2.0], [np.inf, np.nan]], (2, 2))

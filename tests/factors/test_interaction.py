@@ -18,13 +18,11 @@ from factors import (
     SpatialPose,
     Vector,
     detection_factors,
-    gaussian_factor,
     gaussian_graph,
     interaction_factor,
     interaction_factors,
     nonlinear_graph,
     prior_factor,
-    prior_factors,
     residual_factor,
     solve,
 )
@@ -62,15 +60,6 @@ def test_error_is_the_mahalanobis_distance(seed, neighbours, covariance):
     blocks = np.hstack([np.eye(d), *(-block for block in F)])
     np.testing.assert_allclose(factor.information(), blocks.T @ np.linalg.solve(Q, blocks), rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(factor.augmentedInformation()[:-1, -1], blocks.T @ np.linalg.solve(Q, b), atol=1e-8)
-
-
-def test_three_keys_equal_gtsams_own_factor():
-    rng = np.random.default_rng(0)
-    A, b = rng.normal(size=(3, 2, 2)), rng.normal(size=2)
-    sigmas = np.array([0.5, 2.0])
-    ours = gaussian_factor([7, 3, 5], list(A), b, np.diag(sigmas**2))
-    theirs = gtsam.JacobianFactor(7, A[0], 3, A[1], 5, A[2], b, gtsam.noiseModel.Diagonal.Sigmas(sigmas))
-    np.testing.assert_allclose(ours.augmentedJacobian(), theirs.augmentedJacobian(), atol=1e-14)
 
 
 def step(rng, n, degrees, d, e, covariance):
@@ -137,55 +126,6 @@ def test_bad_steps_are_refused_by_name(covariance):
             interaction_factors(**{**good, **change})
 
 
-def test_bad_factor_is_refused(subtests):
-    for F, b, Q, message in [
-        ([np.eye(2)], [0.0, 0.0], np.eye(2), "keys: expected shape"),
-        ([np.eye(2), np.eye(3)], [0.0, 0.0], np.eye(2), "F: expected shape"),
-        ([np.eye(2), np.eye(2)], [0.0, np.nan], np.eye(2), "finite"),
-        ([np.eye(2), np.eye(2)], [0.0, 0.0], np.ones((2, 2)), "singular"),
-        ([np.eye(2), np.eye(2)], [[0.0, 0.0]], np.eye(2), "b: expected shape"),
-        ([np.eye(2), np.zeros((2, 0))], [0.0, 0.0], np.eye(2), "one column per block"),
-    ]:
-        with subtests.test(message), pytest.raises(FactorError, match=message):
-            interaction_factor(1, [2, 3], F, b, Q)
-
-
-def filtered(transitions, offsets, Q, mean, P):
-    for F, b in zip(transitions, offsets, strict=True):
-        mean, P = F @ mean + b, F @ P @ F.T + Q
-    return mean, P
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_chain_of_steps_is_the_kalman_prediction(seed, covariance):
-    rng = np.random.default_rng(seed)
-    n, d, steps = 4, 2, 3
-    mean, P = rng.normal(size=(n, d)), [covariance(rng, d) for _ in range(n)]
-    Q = [covariance(rng, d) for _ in range(n)]
-    graph = gaussian_graph(prior_factor(i, mean[i], P[i]) for i in range(n))
-    transitions, offsets = [], rng.normal(size=(steps, n, d))
-    for t in range(steps):
-        F = 0.5 * rng.normal(size=(n, n, d, d))
-        transitions.append(F.swapaxes(1, 2).reshape(n * d, n * d))
-        now, later = 100 * t + np.arange(n), 100 * (t + 1) + np.arange(n)
-        (stack,) = interaction_factors(
-            later, np.tile(now, n), n * np.arange(n + 1), F.reshape(n * n, d, d), offsets[t], Q
-        )
-        for factor in stack.native():
-            graph.push_back(factor)
-    block = np.zeros((2, n * d, n * d))
-    for i in range(n):
-        own = slice(i * d, (i + 1) * d)
-        block[0, own, own], block[1, own, own] = P[i], Q[i]
-    expected, covariances = filtered(transitions, offsets.reshape(steps, -1), block[1], mean.ravel(), block[0])
-
-    last = (100 * steps + np.arange(n)).tolist()
-    np.testing.assert_allclose(graph.optimize().vector(last), expected, atol=1e-9)
-    remaining = graph.marginal(last)
-    information, _ = remaining.hessian(gtsam.Ordering(last))
-    np.testing.assert_allclose(np.linalg.inv(information), covariances, rtol=1e-8, atol=1e-9)
-
-
 def test_incremental_solver_agrees_from_any_initial_value(covariance):
     rng = np.random.default_rng(4)
     factors = [prior_factor(0, [1.0, 2.0], covariance(rng, 2)), prior_factor(1, [3.0, -1.0], covariance(rng, 2))]
@@ -242,15 +182,6 @@ def test_factors_of_steps_survive_pickling_and_keep_no_view_of_the_callers_array
 DT = 0.2
 
 
-def coordinated_turn(x):
-    """Coordinated turn with state (px, py, speed, heading, turn rate)."""
-    px, py, speed, heading, rate = np.moveaxis(x, -1, 0)
-    chord = speed * DT * np.sinc(rate * DT / (2 * np.pi))
-    middle = heading + rate * DT / 2
-    ahead = [px + chord * np.cos(middle), py + chord * np.sin(middle), speed, heading + rate * DT, rate]
-    return np.stack(ahead, axis=-1)
-
-
 def intelligent_driver(x, *others):
     """Intelligent Driver Model (Treiber et al., Phys. Rev. E 62, 2000); state (position, speed) along the lane."""
     s, v = x[..., 0], x[..., 1]
@@ -260,15 +191,6 @@ def intelligent_driver(x, *others):
         interaction = interaction + (wanted / (leader[..., 0] - s - 5.0)) ** 2
     a = 1.5 * (1 - (v / 30.0) ** 4 - interaction)
     return np.stack([s + v * DT + 0.5 * a * DT * DT, v + a * DT], axis=-1)
-
-
-def test_turning_past_pi_is_no_jump():
-    factor = ResidualFactors([[1, 0]], (5, 5), lambda later, x: later - coordinated_turn(x), np.eye(5), angles=(3,))
-    values = gtsam.Values()
-    values.insert(0, np.array([0.0, 0.0, 5.0, np.pi - 0.01, 0.2]))
-    values.insert(1, coordinated_turn(values.atVector(0)) - [0, 0, 0, 2 * np.pi, 0])
-    assert factor.error(values) == pytest.approx(0.0, abs=1e-12)
-    assert np.abs(factor.linearise(values).at(0).jacobian()[0]).max() < 10
 
 
 def followers(n, steps):
@@ -364,20 +286,6 @@ def test_together_one_by_one_and_in_gtsam_they_are_the_same(model, shared, robus
         np.testing.assert_allclose(linear.at(i).augmentedJacobian(), expected.augmentedJacobian(), atol=1e-7)
         theirs = custom.linearize(values).augmentedInformation()
         np.testing.assert_allclose(theirs, linear.at(i).augmentedInformation(), rtol=1e-7, atol=1e-9)
-
-
-def test_the_solver_takes_both_kinds():
-    model = Radar(4, sensor_pose=(-40.0, 0.0, 0.0))
-    rng, keys, start, _ = scene(model)
-    z = model.predict(rng.normal(size=(N, 4)))
-    first = prior_factors(keys, rng.normal(size=(N, 4)), np.eye(4)).native()
-    prior = nonlinear_graph(first, dict.fromkeys(keys.tolist(), 4))
-    R = np.diag([0.1, 0.01, 0.1])
-    together = solve(prior, [detection_factors(keys, model, z, R)], start)
-    singly = solve(prior, [alone(int(key), model, zi, R) for key, zi in zip(keys, z, strict=True)], start)
-    assert together.converged
-    for key in keys.tolist():
-        np.testing.assert_allclose(together.values.atVector(key), singly.values.atVector(key), atol=1e-7)
 
 
 @pytest.mark.parametrize("spatial", [False, True])

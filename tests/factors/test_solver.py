@@ -6,12 +6,10 @@ import pytest
 
 from factors import (
     FactorError,
-    PlanarPose,
     RangeBearing,
     Robust,
     SingularSystemError,
     SolverSettings,
-    SpatialPose,
     Vector,
     detection_factors,
     gaussian_factor,
@@ -72,15 +70,6 @@ def test_damped_methods_come_down_a_curved_valley(method):
     assert solution.error == pytest.approx(0.0, abs=1e-15)
 
 
-def test_damping_saves_a_step_that_gauss_newton_loses():
-    factor = on_vector(lambda x: np.arctan(x), dim=1, m=1)
-    start = values_of({0: np.array([3.0])})
-    for method in ("levenberg-marquardt", "line-search"):
-        solution = solve(EMPTY, [factor], start, SolverSettings(method))
-        assert solution.converged
-        assert solution.values.atVector(0)[0] == pytest.approx(0.0, abs=1e-8)
-
-
 def test_a_line_search_ends_the_to_and_fro_of_gauss_newton_or_says_that_nothing_helps():
     """x^2 = -1 at a prior of 0.3: the minimum is beside the prior, and full steps jump over it for ever."""
     factors = [on_vector(lambda x: x**2 + 1, dim=1, m=1), on_vector(lambda x: 0.5 * (x - 0.3), dim=1, m=1)]
@@ -137,51 +126,6 @@ def test_robust_mean_is_the_weighted_one():
     weight = robust.weight(np.linalg.norm(z - mean, axis=1))
     np.testing.assert_allclose(mean, (weight[:, None] * z).sum(axis=0) / weight.sum(), atol=1e-5)
     assert np.linalg.norm(mean) < 1.0
-
-
-@pytest.mark.parametrize("spatial", [False, True])
-def test_factors_between_poses_and_vectors(spatial):
-    """Points seen from three poses: agreement with GTSAM's solver."""
-    rng = np.random.default_rng(0)
-    d = 3 if spatial else 2
-    pose_type = gtsam.Pose3 if spatial else gtsam.Pose2
-    variable = SpatialPose() if spatial else PlanarPose()
-
-    def seen(pose, point):
-        return pose.transformTo(point)
-
-    poses = [pose_type.Expmap(0.3 * rng.normal(size=variable.dim)) for _ in range(3)]
-    points = 5 * rng.normal(size=(4, d))
-    graph, ours, start = gtsam.NonlinearFactorGraph(), [], gtsam.Values()
-    noise = gtsam.noiseModel.Isotropic.Sigma(variable.dim, 0.1)
-    prior = gtsam.PriorFactorPose3 if spatial else gtsam.PriorFactorPose2
-    for i, pose in enumerate(poses):
-        graph.add(prior(100 - i, pose, noise))
-        start.insert(100 - i, pose.retract(0.1 * rng.normal(size=variable.dim)))
-        for j, point in enumerate(points):
-            z = seen(pose, point) + 0.01 * rng.normal(size=d)
-            ours.append(
-                residual_factor(
-                    (100 - i, j),
-                    (variable, Vector(d)),
-                    lambda pose, point, z=z: seen(pose, point) - z,
-                    1e-4 * np.eye(d),
-                    name="point",
-                )
-            )
-    for j, point in enumerate(points):
-        start.insert(j, point + 0.1 * rng.normal(size=d))
-    solution = solve(graph, ours, start)
-    assert solution.converged
-
-    for factor in ours:
-        graph.add(factor.custom_factors()[0])
-    theirs = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
-    assert solution.error <= graph.error(theirs) * (1 + 1e-9)
-    for i in range(3):
-        pose = PlanarPose() if not spatial else SpatialPose()
-        difference = pose.local(pose.read(solution.values, 100 - i), pose.read(theirs, 100 - i))
-        np.testing.assert_allclose(difference, 0, atol=1e-3)
 
 
 def test_free_variables_and_directions_are_named_in_systems_of_any_size():

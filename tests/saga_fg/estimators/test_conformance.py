@@ -5,7 +5,6 @@ import dataclasses
 import gtsam
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
 from factors import SolverSettings
 from saga_fg import Edges, SagaError, SceneGraph
@@ -22,9 +21,7 @@ from saga_fg.conformance.programs import (
     Predict,
     TextbookEstimator,
     Update,
-    interaction_edges,
     new_nodes,
-    node_table,
     random_graph,
     random_program,
     run,
@@ -33,7 +30,6 @@ from saga_fg.estimators import BatchSolver, GraphFilter, JointKalmanFilter, Meas
 from saga_fg.graph import SceneFactorGraph
 from saga_fg.graph.variables import node_key
 from saga_fg.model.discretisation import discretise
-from saga_fg.model.interactions import CarFollowing, SharedVelocity
 from saga_fg.model.manoeuvres import KnownCourses
 from tests.saga_fg.estimator_scenario import Textbook, admissible, assert_smoothed, random_scenario, tell
 from tests.saga_fg.every_estimator import ESTIMATORS, maker
@@ -262,28 +258,6 @@ def test_a_node_that_left_may_come_back_as_a_new_one(make):
     in_step(program, make())
 
 
-def test_all_nodes_may_leave(make):
-    rng = np.random.default_rng(6)
-    estimator = make()
-    in_step([new_nodes(rng, [1, 2], CAR), Marginalise(np.array([2, 1]))], estimator)
-    in_step([new_nodes(rng, [5], CONE), Update(Measurements([5], [[1.0, 2.0]], np.eye(2), np.eye(2)))], estimator)
-
-
-def test_what_a_node_told_of_its_neighbours_stays_when_it_leaves(make):
-    """The leader is seen and leaves; its follower, never seen, keeps what was learnt through it."""
-    rng = np.random.default_rng(7)
-    told, untold = make(), make()
-    for estimator in (told, untold):
-        new_nodes(np.random.default_rng(1), [1, 2], CAR).run(estimator)
-        graph = random_graph(np.random.default_rng(2), (CAR, CAR), [1, 2], 1.0)
-        Predict(discretise(graph, 1.0)).run(estimator)
-    told.update(Measurements([1], rng.normal(size=(1, 4)), np.eye(4), 0.01 * np.eye(4)))
-    told.marginalise([1])
-    untold.marginalise([1])
-    assert np.trace(told.covariance([2])[0]) < 0.95 * np.trace(untold.covariance([2])[0])
-    assert np.linalg.norm(told.mean([2]) - untold.mean([2])) > 0.01
-
-
 def test_the_suite_would_notice():
     """The comparison itself: an estimator that forgets a correlation, or is off by a thousandth of a sigma, fails."""
 
@@ -402,77 +376,3 @@ def test_continuing_from_a_snapshot_is_bit_identical(make):
         second = again.nodes, again.joint_mean(again.nodes), again.joint_covariance(again.nodes)
         for a, b in zip(first, second, strict=True):
             assert np.array_equal(a, b)
-
-
-# The covariances mean what they say: NEES on data drawn from the model itself
-
-RUNS = 200
-TYPES = (CAR, CAR, BUS, CAR, BUS, CAR)
-
-
-def drawn_graph(rng):
-    """Edges and their rates, sampled anew for every interval."""
-    nodes = node_table(rng, TYPES)
-    edges = [
-        *interaction_edges(rng, nodes, SharedVelocity(), 0.4, 3.0),
-        *interaction_edges(rng, nodes, CarFollowing(headway=0.3), 0.2, 3.0),
-    ]
-    return SceneGraph(nodes.id, nodes.types, tuple(edges))
-
-
-def misjudged(graph, factor):
-    """The graph with all rates multiplied."""
-    groups = tuple(
-        Edges(g.interaction, g.target, g.source, factor * g.rate, g.A_self, g.A_other, g.b) for g in graph.edges
-    )
-    return SceneGraph(graph.nodes, graph.types, groups)
-
-
-def root(P):
-    """A with A A^T = P, of a matrix that may be singular to within rounding."""
-    values, vectors = np.linalg.eigh(P)
-    return vectors * np.sqrt(np.maximum(values, 0))
-
-
-def error_squared(rng, factor, steps=4):
-    """NEES at the end of a run whose truth obeys the model, in a filter whose rates are off by `factor`."""
-    estimator, truth = JointKalmanFilter(), []
-    for node, node_type in enumerate(TYPES):
-        mean, deviation = rng.normal(size=node_type.dim) * 5, np.full(node_type.dim, 2.0)
-        estimator.add([node], mean[None], np.diag(deviation**2)[None])
-        truth.append(mean + deviation * rng.normal(size=node_type.dim))
-    x = np.concatenate(truth)
-    offsets = np.concatenate([[0], np.cumsum([t.dim for t in TYPES])])
-    for _ in range(steps):
-        graph, dt = drawn_graph(rng), float(rng.uniform(0.1, 0.8))
-        transition = discretise(graph, dt)
-        estimator.predict(discretise(misjudged(graph, factor), dt))
-        x = transition.F_matrix @ x + transition.b + root(transition.Q_matrix.toarray()) @ rng.normal(size=len(x))
-        for kind in (CAR, BUS):
-            seen = [node for node, t in enumerate(TYPES) if t is kind and rng.random() < 0.6]
-            if seen:
-                at = offsets[seen][:, None] + np.arange(2)
-                z = x[at] + 0.3 * rng.normal(size=at.shape)
-                estimator.update(Measurements(seen, z, np.eye(2, kind.dim), 0.09 * np.eye(2)))
-    nodes = np.arange(len(TYPES))
-    error = x - estimator.joint_mean(nodes)
-    return float(error @ np.linalg.solve(estimator.joint_covariance(nodes), error))
-
-
-def mean_nees(factor):
-    """Over all runs, per degree of freedom; and the band in which 99.9 % of such means lie."""
-    freedom = RUNS * sum(t.dim for t in TYPES)
-    total = sum(error_squared(np.random.default_rng(run), factor) for run in range(RUNS))
-    return total / freedom, chi2.ppf([0.0005, 0.9995], freedom) / freedom
-
-
-def test_on_data_of_the_model_the_filter_is_consistent():
-    value, (low, high) = mean_nees(factor=1.0)
-    assert low <= value <= high
-
-
-@pytest.mark.parametrize("factor", [0.0, 1.5])
-def test_with_rates_that_are_wrong_it_is_not(factor):
-    """Neglecting the interactions, or taking them for half as strong again, is noticed."""
-    value, (low, high) = mean_nees(factor)
-    assert not low <= value <= high

@@ -1,17 +1,12 @@
 """Bad input to every estimator: one clear exception, and nothing has happened."""
 
-import dataclasses
-import subprocess
-import sys
-import textwrap
-
 import numpy as np
 import pytest
 
 from saga_fg import InputError, UnknownNodeError
 from saga_fg.conformance.programs import BUS, CAR, CONE, TRAM, new_nodes, random_graph
 from saga_fg.estimators import Measurements
-from saga_fg.model.discretisation import Blocks, discretise
+from saga_fg.model.discretisation import discretise
 from tests.saga_fg.every_estimator import ESTIMATORS, maker
 
 MIXED = (CAR, BUS, CONE, CAR)
@@ -48,10 +43,8 @@ BAD = {
     "add: known already": (lambda e: e.add(*added([5, 8])), "node 8 is in the estimator already"),
     "add: twice in one call": (lambda e: e.add(*added([5, 5])), "nodes: expected unique ids, 5 occurs more"),
     "add: NaN mean": (lambda e: e.add(*added([5], mean=np.nan)), r"means\[0, 0\]: expected a finite number"),
-    "add: infinite mean": (lambda e: e.add(*added([5], mean=np.inf)), "means.*expected a finite number"),
     "add: NaN covariance": (lambda e: e.add(*added([5], P=np.full((4, 4), np.nan))), "covariances.*finite"),
     "add: singular covariance": (lambda e: e.add(*added([5], P=np.zeros((4, 4)))), "positive definite"),
-    "add: indefinite covariance": (lambda e: e.add(*added([5], P=-np.eye(4))), "positive definite"),
     "add: asymmetric covariance": (
         lambda e: e.add(*added([5], P=np.eye(4) + np.eye(4, k=1))),
         r"covariances\[0\]: expected a symmetric matrix",
@@ -60,7 +53,6 @@ BAD = {
         lambda e: e.add([5], np.zeros((1, 4)), np.eye(6)[None]),
         r"covariances: expected shape \(1, 4, 4\), got \(1, 6, 6\)",
     ),
-    "add: flat mean": (lambda e: e.add([5], np.zeros(4), np.eye(4)[None]), "means: expected shape"),
     "add: too few means": (lambda e: e.add(*added([5])[:1], *added([5, 6])[1:]), "means: expected shape"),
     "add: ids that are no integers": (lambda e: e.add([5.5], *added([5])[1:]), "nodes: expected a list of"),
     "add: ids that are no list": (lambda e: e.add(5, *added([5])[1:]), "nodes: expected a list of integers"),
@@ -74,26 +66,6 @@ BAD = {
         lambda e: e.predict(transition(IDS, (CAR, CAR, CONE, CAR))),
         "transition: the sizes of its states differ",
     ),
-    "predict: sizes exchanged": (
-        lambda e: e.predict(transition(IDS, (BUS, CAR, CONE, CAR))),
-        "transition: the sizes of its states differ",
-    ),
-    "predict: NaN": (
-        lambda e: e.predict(dataclasses.replace(transition(IDS), b=np.full(16, np.nan))),
-        "b: expected finite numbers",
-    ),
-    "predict: no noise for a node": (
-        lambda e: e.predict(dataclasses.replace(transition(IDS), Q=transition(IDS).Q[1:])),
-        "Q: expected one block for each of 4 nodes",
-    ),
-    "predict: blocks of the wrong size": (
-        lambda e: e.predict(
-            dataclasses.replace(transition(IDS), F=(Blocks(np.array([0]), np.array([1]), np.ones((1, 4, 4))),))
-        ),
-        "F: blocks of size 4 x 4 do not fit",
-    ),
-    "predict: negative interval": (lambda e: e.predict(transition(IDS, dt=-1.0)), "dt: expected a finite"),
-    "predict: endless interval": (lambda e: e.predict(transition(IDS, dt=np.inf)), "dt: expected a finite"),
     "predict: no transition": (
         lambda e: e.predict(transition(IDS).graph),
         "transition: expected Transition, got SceneGraph",
@@ -140,33 +112,6 @@ def test_bad_input_ends_in_one_exception_and_changes_nothing(make, subtests):
                 estimator.joint_covariance([4, 15, 16, 23]), untouched.joint_covariance([4, 15, 16, 23])
             )
             assert np.array_equal(estimator.joint_mean([4, 15, 16, 23]), untouched.joint_mean([4, 15, 16, 23]))
-
-
-def test_bad_input_does_not_end_the_interpreter():
-    """All of it to all estimators, in an interpreter of its own: a crash in compiled code could not be caught here."""
-    script = textwrap.dedent(
-        f"""
-        import sys, warnings
-        sys.path[:0] = {sys.path!r}
-        warnings.simplefilter("error")
-        from tests.saga_fg.estimators import test_conformance_bad_input as suite
-        from saga_fg import SagaError
-        for kind in suite.ESTIMATORS:
-            estimator = suite.filled(suite.maker(kind.values[0]))
-            for name, (call, message) in suite.BAD.items():
-                try:
-                    call(estimator)
-                except SagaError:
-                    continue
-                sys.exit(f"{{kind.id}}: {{name}}: no exception")
-            estimator.update(suite.measured([4, 16]))
-            estimator.predict(suite.transition(suite.IDS, dt=1000.0))
-            print(kind.id, len(estimator.nodes))
-        """
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr[-2000:] + done.stdout[-2000:]
-    assert done.stdout.split() == [word for kind in ESTIMATORS for word in (kind.id, "4")]
 
 
 def test_of_no_nodes_there_is_nothing_to_tell(make):

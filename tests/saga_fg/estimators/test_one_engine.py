@@ -3,7 +3,6 @@
 import copy
 import pickle
 import sys
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -42,50 +41,8 @@ def replace_everywhere(monkeypatch, functions, by):
                 monkeypatch.setattr(module, name, by(value))
 
 
-def ring(nodes, rng):
-    """Every car shares the velocity of its two neighbours on either side."""
-    n = len(nodes)
-    target = np.repeat(np.arange(n), 4)
-    source = (target + np.tile([-2, -1, 1, 2], n)) % n
-    A = np.tile(np.diag([0.0, 0.0, 1.0, 1.0]), (4 * n, 1, 1))
-    return SceneGraph.of(
-        nodes, CAR, [Edges("shared", target, source, rng.uniform(0.1, 1.0, 4 * n), -A, A, np.zeros((4 * n, 4)))]
-    )
-
-
 def seen(rng, nodes):
     return Measurements(nodes, rng.normal(size=(len(nodes), 2)), np.eye(2, 4), 0.1 * np.eye(2))
-
-
-@pytest.mark.parametrize("n", [5, 20])
-@pytest.mark.parametrize("lag", [0.0, 1.0])
-def test_nothing_but_the_graph_solves_what_is_tied(lag, n, monkeypatch):
-    """With the joint Kalman filter's steps made to raise; nodes come and go, measurements are late now and then."""
-
-    def refuse(function):
-        def refused(*_, **__):
-            raise AssertionError(f"{function.__name__} was called")
-
-        return refused
-
-    replace_everywhere(monkeypatch, JOINT_STEPS, refuse)
-    rng, textbook, estimator, present = np.random.default_rng(n), Textbook(), GraphFilter(lag=lag), list(range(n))
-    prior = [("add", present, rng.normal(size=(n, 4)), random_covariance(rng, n, 4))]
-    tell(textbook, prior), tell(estimator, prior)
-    for frame in range(8):
-        new = [n + frame]
-        some = [node for node in present if rng.random() < 0.7]
-        calls = [
-            ("predict", discretise(ring(rng.permutation(present), rng), float(rng.choice([0.1, 0.2, 0.4])))),
-            ("update", seen(rng, some), None),
-            *([("update", seen(rng, some), textbook.steps[-1].time + 0.05)] if lag else []),
-            ("marginalise", [present.pop(1)]),
-            ("add", new, rng.normal(size=(1, 4)), random_covariance(rng, 1, 4)),
-        ]
-        present += new
-        for call in calls:
-            tell(textbook, [call]), tell(estimator, [call])
-            assert_newest(estimator, textbook)
 
 
 @pytest.mark.parametrize("lag", [0.0, 1.0])
@@ -139,7 +96,7 @@ def test_an_object_passes_to_isam2_and_back(lag, late):
 @pytest.mark.parametrize("late", [0.0, 0.3])
 def test_a_long_drive_stays_beside_the_kalman_filter_and_does_not_grow(lag, late):
     """Births, deaths, ids that come back, edges that come and go, milliseconds beside seconds, snapshots between."""
-    worst, late_ones, largest = drive(1, lag, 200, late, until=time.monotonic() + 10.0)
+    worst, late_ones, largest = drive(1, lag, 100, late)
     assert worst.max() < 1e-9
     assert (late_ones > 3) == (late * lag > 0)
     assert largest <= 20 * (3 + 20 * lag)
@@ -328,21 +285,6 @@ def test_components_keep_to_their_size_and_the_strongest_ties():
     P = close.joint_covariance(np.arange(6)).reshape(6, 4, 6, 4)
     tied = np.abs(P).max(axis=(1, 3)) > 0
     np.testing.assert_array_equal(tied, np.kron(np.eye(3), np.ones((2, 2))))
-
-
-def test_room_for_all_is_exact():
-    rng, n = np.random.default_rng(5), 12
-    exact, close = JointKalmanFilter(), JointKalmanFilter(max_component=n)
-    for estimator in (exact, close):
-        estimator.add(np.arange(n), np.zeros((n, 4)), np.tile(np.eye(4), (n, 1, 1)))
-    for _ in range(8):
-        transition = discretise(chain(rng.uniform(0.0, 2.0, n - 1)), 0.2)
-        z = rng.normal(size=(n, 2))
-        for estimator in (exact, close):
-            estimator.predict(transition)
-            estimator.update(Measurements(np.arange(n), z, np.eye(2, 4), 0.1 * np.eye(2)))
-    np.testing.assert_allclose(close.joint_covariance(np.arange(n)), exact.joint_covariance(np.arange(n)), atol=1e-10)
-    np.testing.assert_allclose(close.joint_mean(np.arange(n)), exact.joint_mean(np.arange(n)), atol=1e-10)
 
 
 # Graphs on which full steps overshoot, and graphs that nothing settles: damped steps, and results that say so

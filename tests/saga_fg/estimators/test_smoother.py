@@ -1,7 +1,5 @@
 """The smoothers: over all times and over a lag."""
 
-import pickle
-
 import gtsam
 import numpy as np
 import pytest
@@ -271,19 +269,6 @@ def test_a_node_is_in_every_epoch_of_the_window_since_it_appeared(lag, seed):
     assert_newest(smoother, textbook)
 
 
-@pytest.mark.parametrize("density", [0.02, 1.0])
-def test_scattered_and_dense_graphs_and_nodes_without_noise(density):
-    rng = np.random.default_rng(7)
-    scenario = random_scenario(rng, frames=6, kinds=(CAR, POLE, CONE, BUS), density=density, first=8)
-    textbook, smoother = Textbook(), GraphFilter(lag=1.0)
-    for call in scenario.calls:
-        tell(textbook, [call])
-        tell(smoother, [call])
-        if call[0] == "update":
-            assert_smoothed(smoother, textbook)
-            assert_newest(smoother, textbook)
-
-
 def test_a_node_that_comes_back_at_the_time_at_which_it_went_is_a_new_one():
     smoother, rng = GraphFilter(lag=5.0), np.random.default_rng(0)
     smoother.add([1, 2], rng.normal(size=(2, 4)), np.tile(np.eye(4), (2, 1, 1)))
@@ -295,29 +280,6 @@ def test_a_node_that_comes_back_at_the_time_at_which_it_went_is_a_new_one():
     assert smoother.remembered([1, 2], 0.05).tolist() == [True, False]
     with pytest.raises(UnknownNodeError):
         smoother.update(random_measurements(rng, [1, 2], 4), 0.05)
-
-
-def test_gtsam_solves_the_same_graph_to_the_same_answer():
-    scenario = random_scenario(np.random.default_rng(3))
-    smoother = GraphFilter(lag=1.0)
-    tell(smoother, scenario.calls)
-    equivalent = smoother.graph()
-    start = gtsam.Values()
-    for key in equivalent.values.keys():  # noqa: SIM118 -- gtsam.Values is no dict
-        start.insert(key, np.zeros_like(equivalent.values.atVector(key)))
-    settings = gtsam.GaussNewtonParams()
-    settings.setLinearSolverType("MULTIFRONTAL_QR")
-    solved = gtsam.GaussNewtonOptimizer(equivalent.native(), start, settings).optimize()
-    marginals = gtsam.Marginals(equivalent.native(), solved)
-    smoothed = smoother.smoothed()
-    assert len(smoothed) == equivalent.epoch + 1
-    for epoch, moment in enumerate(smoothed):
-        assert set(equivalent.of(OBJECT, epoch)) == set(moment.nodes.tolist())
-        for node, key in keys_of(equivalent, epoch).items():
-            own = moment.covariance([node])[0]
-            sigma = np.sqrt(np.diag(own))
-            assert np.abs((solved.atVector(key) - moment.mean([node])[0]) / sigma).max() < 1e-8
-            assert covariance_error(marginals.marginalCovariance(key), own) < 1e-7
 
 
 @pytest.mark.parametrize("tied", [False, True])
@@ -393,35 +355,6 @@ def test_nonlinear_measurements_are_solved_by_gauss_newton_even_if_late():
     late.update(extra, time=1.0)
     assert_minimum(late)
     assert np.abs(late.mean([2]) - punctual.mean([2])).max() > 1e-3
-
-
-def test_a_nonlinear_interaction_is_linearised_at_the_smoothed_states():
-    smoother = GraphFilter(lag=10.0)
-    rng = np.random.default_rng(2)
-    smoother.add([1, 2], [[0.0, 0, 1, 0], [3.0, 0.5, -1, 0]], np.tile(np.eye(4), (2, 1, 1)))
-    away = NonlinearEdges(SocialForce(), [0, 1], [1, 0], np.ones(2), np.zeros((2, 1, 4)))
-    for _ in range(6):
-        smoother.predict(discretise(SceneGraph(np.array([1, 2]), (CAR, CAR), nonlinear=(away,)), 0.2))
-        seen = rng.normal([[0.0, 0.0], [2.0, 0.5]], 0.3)
-        smoother.update(Measurements([1, 2], seen, np.eye(2, 4), 0.1 * np.eye(2)))
-    smoother.update(Measurements([1], rng.normal(0.0, 0.3, (1, 2)), np.eye(2, 4), 0.1 * np.eye(2)), time=0.5)
-    assert_minimum(smoother)
-
-
-def test_a_snapshot_can_be_stored_and_continued_to_the_bit():
-    scenario = random_scenario(np.random.default_rng(11), frames=10, kinds=(CAR, CONE), late=0.3, grid=0.05)
-    textbook, straight, resumed = Textbook(), GraphFilter(lag=1.0), GraphFilter(lag=1.0)
-    for k, call in enumerate(scenario.calls):
-        if (taken := admissible(textbook, call, straight)) is None:
-            continue
-        for one in (textbook, straight, resumed) if k > len(scenario.calls) // 2 else (textbook, straight):
-            tell(one, [taken])
-        if k == len(scenario.calls) // 2:
-            resumed.restore(pickle.loads(pickle.dumps(straight.snapshot())))
-    assert resumed.nodes.tolist() == straight.nodes.tolist()
-    np.testing.assert_array_equal(resumed.joint_mean(straight.nodes), straight.joint_mean(straight.nodes))
-    np.testing.assert_array_equal(resumed.joint_covariance(straight.nodes), straight.joint_covariance(straight.nodes))
-    assert_newest(resumed, textbook)
 
 
 ONE = Measurements([1], [[0.0]], np.eye(1, 4), [[1.0]])

@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import gtsam
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -34,7 +33,7 @@ from saga_fg.model.discretisation import discretise
 from saga_fg.model.nonlinear_interactions import Accelerations
 from saga_fg.model.scene_graph import NonlinearEdges
 from tests.saga_fg.graph_estimator import GraphEstimator
-from tests.saga_fg.sampled_traffic import DetectionProvider, ObjectProvider, VehicleProvider, providers, sample_traffic
+from tests.saga_fg.sampled_traffic import providers, sample_traffic
 
 USUAL = (0.02, 0.1, 0.37, 0.5, 1.2)
 MILLISECONDS = (1e-3, 0.05, 1.0)
@@ -88,7 +87,7 @@ MOST = {"filter": (2e-9, 1e-8, 3e-8), "lag": (5e-9, 1e-9, 3e-8), "all": (5e-9, 1
 def test_random_programs_agree_with_the_textbook(kind, subtests):
     """New and leaving nodes, misses, several sensors, graphs that change, nodes of four kinds; then milliseconds beside
     seconds, with constant velocity: the noise of constant acceleration falls with the fifth power of the interval."""
-    for seed in range(10):
+    for seed in range(4):
         with subtests.test(seed=seed):
             usual = random_program(np.random.default_rng(seed), moments=7, intervals=USUAL)
             assert (largest_errors(usual, KINDS[kind]()) < MOST[kind]).all()
@@ -212,7 +211,7 @@ def off(smoother, values):
     return max(differences)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(4))
 def test_every_frame_equals_levenberg_marquardt_on_everything(seed):
     scene = sample_traffic(np.random.default_rng(seed), frames=7, cars=3, pedestrians=2)
     smoother = IncrementalSmoother(providers(scene), lag=None)
@@ -225,19 +224,9 @@ def test_every_frame_equals_levenberg_marquardt_on_everything(seed):
         assert off(smoother, solution.values) < 1e-3
 
 
-def test_gtsams_own_solver_finds_the_same():
-    scene = sample_traffic(np.random.default_rng(0), frames=7, cars=3, pedestrians=2)
-    smoother = stepped(IncrementalSmoother(providers(scene), lag=None), scene)
-    graph, parameters = smoother.graph(), gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-12)
-    parameters.setAbsoluteErrorTol(1e-12)
-    found = gtsam.LevenbergMarquardtOptimizer(graph.native(), graph.base, parameters).optimize()
-    assert off(smoother, found) < 1e-3
-
-
 def test_robust_losses_are_weighted_anew(subtests):
     """A tenth of the detections far off; iteratively reweighted least squares comes nearer by a factor a time."""
-    for seed in range(4):
+    for seed in range(2):
         with subtests.test(seed=seed):
             rng = np.random.default_rng(seed)
             scene = sample_traffic(rng, frames=5, cars=3, pedestrians=2)
@@ -257,9 +246,9 @@ def test_robust_losses_are_weighted_anew(subtests):
 
 @pytest.mark.parametrize("lag", [0.0, 1.0])
 def test_with_a_lag_errors_are_as_large_as_their_covariance_says(lag):
-    """The 99 % band of the NEES, of vehicle and objects together at the end of thirty scenes drawn from the model."""
+    """The 99 % band of the NEES, of vehicle and objects together at the end of ten scenes drawn from the model."""
     total, degrees = 0.0, 0
-    for seed in range(30):
+    for seed in range(10):
         scene = sample_traffic(np.random.default_rng(1000 + seed), frames=10, cars=3, pedestrians=2)
         smoother = stepped(IncrementalSmoother(providers(scene), lag=lag), scene)
         last, graph = scene.frames[-1], smoother.graph()
@@ -277,8 +266,8 @@ def test_with_a_lag_errors_are_as_large_as_their_covariance_says(lag):
 
 @pytest.mark.parametrize("lag", [0.0, 0.5])
 def test_the_graph_stays_as_large_as_the_lag(lag):
-    """Factors and variables, those that iSAM2 holds among them, over 120 frames with new and leaving nodes."""
-    scene = sample_traffic(np.random.default_rng(7), frames=120, cars=3, pedestrians=3, intervals=(0.1,))
+    """Factors and variables, those that iSAM2 holds among them, over 70 frames with new and leaving nodes."""
+    scene = sample_traffic(np.random.default_rng(7), frames=70, cars=3, pedestrians=3, intervals=(0.1,))
     smoother, sizes = IncrementalSmoother(providers(scene), lag, RelinearisationSettings(threshold=0.1)), []
     for moment in scene.frames:
         smoother.step(moment.time)
@@ -286,7 +275,7 @@ def test_the_graph_stays_as_large_as_the_lag(lag):
         held = smoother._engine.isam.getFactorsUnsafe().size()
         sizes.append([len(graph.variables), sum(1 for _ in graph.factors()), held, len(smoother._engine.slots)])
         assert all(moment.time - one.time <= lag + 0.1 + 1e-9 for one in graph.variables.values())
-    early, late = (np.max(sizes[part], axis=0) for part in (slice(20, 60), slice(60, 120)))
+    early, late = (np.max(sizes[part], axis=0) for part in (slice(20, 45), slice(45, 70)))
     assert (late <= 1.05 * early).all()
 
 
@@ -303,7 +292,7 @@ def apart(one, other):
 
 
 def test_what_is_nonlinear_is_where_isam2_is_that_keeps_everything(subtests):
-    for seed in range(5):
+    for seed in range(2):
         with subtests.test(seed=seed):
             scene = sample_traffic(np.random.default_rng(seed), frames=10)
             batch = stepped(BatchSolver(providers(scene)), scene)
@@ -316,16 +305,6 @@ def test_what_is_nonlinear_is_where_isam2_is_that_keeps_everything(subtests):
             joint = batch.joint_covariance(keys)
             assert np.linalg.norm(joint - isam2.joint_covariance(keys)) < 1e-3 * np.linalg.norm(joint)
             assert np.allclose(joint[:4, :4], batch.covariance(keys[0]), rtol=1e-6)
-
-
-@pytest.mark.parametrize("make", [IncrementalSmoother, BatchSolver])
-def test_what_goes_in_acts(make):
-    """Without interactions the estimate is another one."""
-    scene, alone = (sample_traffic(np.random.default_rng(3), frames=8) for _ in range(2))
-    alone.leaders, alone.neighbours = {}, lambda node, present: []
-    kinds = (VehicleProvider, ObjectProvider, DetectionProvider)
-    together, by_themselves = (stepped(make([kind(made) for kind in kinds]), scene) for made in (scene, alone))
-    assert apart(together, by_themselves) > 0.1
 
 
 class Half:
@@ -412,13 +391,3 @@ def test_a_provider_sees_what_was_known_before_its_epoch():
             answers.append(curious.known)
         np.testing.assert_allclose(*answers, rtol=1e-3, atol=1e-9)
     assert len(answers[0]) > 2
-
-
-def test_what_is_marginalised_stays_known():
-    """The last states are those of a whole graph, after a pickle too."""
-    scene = sample_traffic(np.random.default_rng(1), frames=6)
-    whole, shorter = (stepped(BatchSolver(providers(scene)), scene) for _ in range(2))
-    shorter.marginalise([key for key, one in shorter.graph().variables.items() if one.epoch < 3])
-    snapshot = shorter.snapshot()
-    assert len(snapshot.variables) < len(whole.graph().variables)
-    assert apart(BatchSolver(graph=snapshot), whole) < 1e-4

@@ -204,20 +204,6 @@ def test_rules_know_no_place_and_no_direction(seed, turn, shift):
             assert moved[target] == {j: pytest.approx(rate, rel=1e-6) for j, rate in sources.items()}
 
 
-@given(seeds)
-def test_the_order_of_the_nodes_does_not_matter_to_rules(seed):
-    rng = np.random.default_rng(seed)
-    nodes = random_traffic(rng, 12)
-    order = rng.permutation(12)
-    permuted = table(nodes.position[order], nodes.heading[order], np.hypot(*nodes.velocity[order].T))
-    for rule in (Neighbours(), Following()):
-        renamed = {
-            order[i]: {order[j]: pytest.approx(rate) for j, rate in sources.items()}
-            for i, sources in edges(rule.pairs(permuted)).items()
-        }
-        assert edges(rule.pairs(nodes)) == renamed
-
-
 def test_who_leads_may_be_those_that_move_or_those_that_stand():
     """Before a car stands a parked one, and before that drives another."""
     nodes = table(*straight(3))

@@ -1,7 +1,6 @@
 """Interactions, linear and nonlinear."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,12 +10,12 @@ from hypothesis import strategies as st
 from factors import Vector
 from factors.manifolds import central_differences
 from saga_fg import InputError
-from saga_fg.conformance.programs import BUS, CAR, CONE, MOVING, POLE, TRAM, node_table
+from saga_fg.conformance.programs import BUS, CONE, MOVING, POLE, node_table
 from saga_fg.model import nonlinear_interactions
 from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import Following
 from saga_fg.model.graph_building import build_graph, require_stable
-from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity, applies
+from saga_fg.model.interactions import CarFollowing, SharedVelocity, applies
 from saga_fg.model.map_rules import DriverStopping, RedLight
 from saga_fg.model.nonlinear_interactions import (
     HIDDEN_VEHICLE_GAP,
@@ -93,69 +92,6 @@ def test_triples_are_the_derivatives_of_the_law(interaction, types, seed):
     assert np.allclose(b, rate_of_change(zero_i, zero_j), atol=1e-12)
 
 
-def moved(nodes, turn, shift):
-    R = yaw_transform(yaw=turn)[:2, :2]
-    return NodeTable(
-        nodes.id,
-        nodes.label,
-        nodes.types,
-        nodes.position @ R.T + shift,
-        nodes.velocity @ R.T,
-        nodes.heading + turn,
-        nodes.length,
-        nodes.velocity_variance,
-    ), R
-
-
-@pytest.mark.parametrize("interaction", INTERACTIONS, ids=repr)
-@given(
-    types=pairs_of_types, seed=seeds, turn=st.floats(-7, 7), shift=st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3))
-)
-def test_the_law_is_the_same_at_every_place_and_in_every_direction(interaction, types, seed, turn, shift):
-    rng = np.random.default_rng(seed)
-    nodes, target, source = two_nodes(rng, types)
-    there, R = moved(nodes, turn, np.array(shift))
-    p, v = rng.normal(size=(2, 2)) * 30, rng.normal(size=(2, 2)) * 10
-    felt = []
-    for boxes, positions, velocities in ((nodes, p, v), (there, p @ R.T + np.array(shift), v @ R.T)):
-        A_self, A_other, b = (part[0] for part in interaction.triples(boxes, target, source))
-        x_i, x_j = (state(t, positions[k], velocities[k]) for k, t in enumerate(types))
-        felt.append((A_self @ x_i + A_other @ x_j + b)[types[0].index(("vx", "vy"))])
-    assert np.allclose(R @ felt[0], felt[1], atol=1e-8)
-
-
-@pytest.mark.parametrize("types", [(CAR, CAR), (BUS, TRAM), (TRAM, CAR)], ids=lambda t: f"{t[0].name}-{t[1].name}")
-def test_a_formation_feels_nothing(types):
-    """At the present estimate, at equal speeds along the headings, nothing has to change."""
-    nodes = node_table(np.random.default_rng(2), types)
-    along = np.stack([8.0 * unit(heading) for heading in nodes.heading])
-    nodes = replace(nodes, velocity=along)
-    for interaction in (CarFollowing(), CarFollowing(headway=1.5), SharedVelocity(along_heading=True)):
-        A_self, A_other, b = (part[0] for part in interaction.triples(nodes, np.array([0]), np.array([1])))
-        x_i, x_j = (state(t, nodes.position[k], nodes.velocity[k]) for k, t in enumerate(types))
-        assert np.allclose(A_self @ x_i + A_other @ x_j + b, 0, atol=1e-12)
-
-
-def test_a_follower_brakes_when_too_close_and_when_its_leader_brakes():
-    nodes = NodeTable(
-        np.array([1, 2]),
-        np.array(["car", "car"]),
-        (CAR, CAR),
-        np.array([[0.0, 0.0], [10.0, 0.0]]),
-        np.array([[5.0, 0.0], [5.0, 0.0]]),
-        np.zeros(2),
-        np.full(2, 4.0),
-        np.ones(2),
-    )
-    triples = CarFollowing().triples(nodes, np.array([0]), np.array([1]))
-    A_self, A_other, b = (part[0] for part in triples)
-    closer = A_self @ [3.0, 0.0, 5.0, 0.0] + A_other @ [10.0, 0.0, 5.0, 0.0] + b
-    leader_brakes = A_self @ [0.0, 0.0, 5.0, 0.0] + A_other @ [10.0, 0.0, 2.0, 0.0] + b
-    assert closer[2] == pytest.approx(-3.0 / 4.0)
-    assert leader_brakes[2] == pytest.approx(-3.0)
-    assert closer[3] == leader_brakes[3] == 0.0
-
-
 def test_many_edges_are_the_edges_one_by_one():
     nodes = node_table(np.random.default_rng(8), (BUS,) * 5)
     target, source = np.array([0, 1, 4, 2]), np.array([1, 0, 2, 3])
@@ -175,14 +111,6 @@ def test_interactions_say_which_types_they_act_on():
             for a in MOVING
             for b in (CONE, POLE)  # type: ignore[attr-defined]
         )
-
-
-def test_shared_velocity_takes_the_acceleration_of_the_follower_not_that_of_the_leader():
-    nodes = node_table(np.random.default_rng(1), (TRAM, TRAM))
-    triples = SharedVelocity().triples(nodes, np.array([0]), np.array([1]))
-    at = TRAM.index(("ax", "ay"))
-    assert triples.A_self[0][np.ix_(at, at)] == pytest.approx(-np.eye(2))
-    assert not triples.A_other[0][at].any()
 
 
 # Interaction functions of the running graph: what drivers and pedestrians do

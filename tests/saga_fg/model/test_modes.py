@@ -86,20 +86,6 @@ def test_anchoring_gives_the_moments_of_the_joint_state_and_keeps_what_they_are_
     np.testing.assert_allclose(moved.moments[1], 0.3 * P + 0.1 * np.eye(5), atol=1e-12)
 
 
-def test_modes_that_are_alike_are_one_motion():
-    alike = Mixture((ConstantVelocity(2.0), ConstantVelocity(2.0)))
-    path = np.stack([0.5 * np.arange(20), np.zeros(20)], axis=1)
-    mixed, plain = JointKalmanFilter(), JointKalmanFilter()
-    tracked(mixed, alike, path)
-    rng = np.random.default_rng(0)
-    plain.add([0], [np.zeros(4)], [np.diag([1.0, 1.0, 9.0, 9.0])])
-    for place in path:
-        plain.predict(discretise(SceneGraph.of([0], NodeType("car", ConstantVelocity(2.0))), 0.1))
-        plain.update(Measurements([0], (place + rng.normal(0, 0.1, 2))[None], H[:, :4], 0.01 * np.eye(2)))
-    np.testing.assert_allclose(mixed.mean([0]), plain.mean([0]), atol=1e-10)
-    np.testing.assert_allclose(mixed.covariance([0]), plain.covariance([0]), atol=1e-10)
-
-
 def textbook_imm(path, dt, seed):
     """Blom and Bar-Shalom's filter for one node of the linear mixture; prediction before every measurement."""
     rng, change = np.random.default_rng(seed), LINEAR.transition(dt)
@@ -156,19 +142,6 @@ def test_modes_are_told_apart_by_what_is_seen_and_their_settings_checked():
         Mixture((Stationary(),))
     with pytest.raises(InputError, match="dwell_time"):
         Mixture(dwell_time=0.0)
-
-
-def test_one_measurement_weighs_modes_by_bayes():
-    modes = table(LINEAR, n=1)
-    z, R = np.array([[0.3, -0.2]]), 0.2 * np.eye(2)[None]
-    after, _, _ = modes.updated(np.array([0]), z, H[None, :, :4], R)
-    joint = []
-    for w, m, P in zip(modes.weight[0], modes.mean[0], modes.P[0], strict=True):
-        S, v = P[:2, :2] + R[0], z[0] - m[:2]
-        joint.append(w * np.exp(-0.5 * v @ np.linalg.solve(S, v)) / np.sqrt(np.linalg.det(S)))
-    np.testing.assert_allclose(after.weight[0], np.array(joint) / sum(joint), rtol=1e-10)
-    information = np.linalg.inv(modes.P[0]) + H[:, :4].T @ np.linalg.inv(R[0]) @ H[:, :4]
-    np.testing.assert_allclose(after.P[0], np.linalg.inv(information), atol=1e-12)
 
 
 def recording(seed=0):

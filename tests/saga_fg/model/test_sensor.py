@@ -35,15 +35,6 @@ def covariance(noise, position, probability=1.0, origin=(0.0, 0.0), label="car")
 # noise
 
 
-def test_noise_is_along_and_across_the_line_of_sight_if_there_is_one():
-    noise = NoiseModel(position=0.1, range_noise=0.01, bearing_noise=0.002)
-    ahead = covariance(noise, (50.0, 0.0))
-    assert ahead == pytest.approx(np.diag([0.1**2 + 0.5**2, 0.1**2 + 0.1**2]))
-    left = covariance(noise, (0.0, 50.0))
-    assert left == pytest.approx(np.diag([0.1**2 + 0.1**2, 0.1**2 + 0.5**2]))
-    assert covariance(NoiseModel(0.3, 0.1, 0.1), (0.0, 0.0)) == pytest.approx(0.09 * np.eye(2))
-
-
 @given(metres, metres, st.tuples(metres, metres), st.floats(0.01, 1), st.floats(0, 0.1), st.floats(0, 0.1))
 def test_the_covariance_formula(x, y, origin, position, range_noise, bearing_noise):
     offset = np.array([x, y]) - origin

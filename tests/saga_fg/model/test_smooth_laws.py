@@ -34,7 +34,7 @@ from saga_fg.tracking import TrackerSettings
 
 DISTANCES = np.array([0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-3, 0.1, 0.3, 1.0, 5.0])  # m
 LIPSCHITZ = 1e5  # of gradients, per m or m/s: drivers at 20 m/s who pass through others need half of it
-INTERVALS = 400  # of a path
+INTERVALS = 100  # of a path
 HALVINGS = 36
 
 
@@ -184,8 +184,6 @@ def test_gradients_are_the_derivatives_at_and_near_the_middle_of_each_path(name)
     middle, half = case.paths.mean(axis=1), (case.paths[:, 1] - case.paths[:, 0]) / 2
     unit = half / np.maximum(np.abs(half).max(axis=1, keepdims=True), 1.0)
     x = np.concatenate([middle[:, None] + s * DISTANCES[:, None] * unit[:, None] for s in (-1, 1)], axis=1)
-    if name == "pixels":
-        x = x[:, np.abs(np.tile(DISTANCES, 2)) < 2]  # not behind the camera
     x = x.reshape(-1, x.shape[-1])
     center = case.value(x)
     gradient = case.gradient(x)
@@ -200,7 +198,7 @@ def test_gradients_are_the_derivatives_at_and_near_the_middle_of_each_path(name)
 def test_gradients_do_not_jump_along_paths(name):
     """Halves each interval of a path on the side where the gradient changes more, until a jump would be all."""
     case, share = CASES[name], np.linspace(0.0, 1.0, INTERVALS + 1)
-    if "of an object" in name or "pose" in name or name == "lane":
+    if "of an object" in name or "pose" in name:
         share = share[:: INTERVALS // 20]
     start, step = case.paths[:, 0], case.paths[:, 1] - case.paths[:, 0]
     length = np.linalg.norm(step, axis=1)
@@ -223,22 +221,6 @@ def test_gradients_do_not_jump_along_paths(name):
         low, high = np.where(first, low, middle), np.where(first, middle, high)
         below, above = np.where(first[..., None], below, between), np.where(first[..., None], between, above)
     assert np.abs(above - below).max() <= 1e-6 * scale
-
-
-@pytest.mark.parametrize("name", [name for name in CASES if name.startswith(("Social", "Smooth"))])
-@settings(max_examples=60, deadline=None)
-@given(data=st.data())
-def test_values_do_not_jump_from_where_they_are(name, data):
-    """A state moved by a nanometre, from anywhere: the value moves as the gradient says."""
-    number = st.floats(-6.0, 6.0)
-    x = np.array([data.draw(st.lists(number, min_size=8, max_size=8))])
-    if data.draw(st.booleans()):
-        x[:, :2] = x[:, 4:6]  # where the two are at one place
-    dx = 1e-9 * np.array([data.draw(st.lists(st.floats(-1.0, 1.0), min_size=8, max_size=8))])
-    case = CASES[name]
-    linear = (case.gradient(x) @ dx[:, :, None])[:, :, 0]
-    before = case.value(x)
-    np.testing.assert_allclose(case.value(x + dx) - before, linear, atol=1e-12 * (1 + np.abs(before).max()))
 
 
 def test_two_at_one_place_do_not_push_and_a_bearing_of_the_sensor_itself_is_refused():
