@@ -6,7 +6,7 @@ function drawRoad(g, road, k, thin) {  // lanes as bands, stop lines and lights 
     for (let i = from; i < values.length; i += 2) g.lineTo(values[i] / 100, values[i + 1] / 100);
     g.stroke();
   };
-  const colourOf = light => road.colours[k][light] === null ? UNREPORTED : SIGNALS[road.colours[k][light]];
+  const colourOf = light => SIGNALS[road.colours[k][light]] ?? UNREPORTED;
   g.save();
   g.lineJoin = "round";
   for (const lane of road.lanes) {

@@ -98,13 +98,13 @@ def road_data(frames: Iterable[Frame], detections: Sequence[Boxes], origin: Floa
             lines.setdefault(line.name, line)
         for lane in known.lanes:
             lanes.setdefault(lane.name, lane)
-    if not lanes and not lights:
+    if not lanes and not lights and not lines:
         return None
     number = {name: k for k, name in enumerate(lights)}
     places = np.array([light.position for light in lights.values()]).reshape(-1, 2)
     return {
         "lanes": [[round(100 * lane.width), *_centimetres(lane.centre, origin)] for lane in lanes.values()],
-        "lines": [[number[line.light], *_centimetres(line.ends, origin)] for line in lines.values()],
+        "lines": [[number.get(line.light, -1), *_centimetres(line.ends, origin)] for line in lines.values()],
         "lights": [_centimetres(place, origin) for place in places],
         "colours": _colours(places, detections),
     }

@@ -7,6 +7,9 @@ at it before they crossed, h, and of those that crossed without, c; the next one
 
     p = h / ( h + c + 1 )
 
+Stop lines of a map that no light governs are such lines from the start, one in each lane, as if `KNOWN` vehicles had
+passed, of which the share `HALTING` halted; counts of traffic are added. At a stop sign so many halt for nobody, too.
+
 Who halts at a line no longer follows a leader that has crossed it: a vehicle that has not is on its own.
 
 While an object and those that act on it are detected, edges make predictions that can be checked. Every `HORIZON` s the
@@ -52,7 +55,7 @@ from saga_fg.model import (
     unit,
 )
 from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, of_classes, wrap_angle
-from saga_fg.types import VEHICLES
+from saga_fg.types import VEHICLES, StopLine
 
 STANDING = 0.6  # s
 STILL, LEAVES = 0.5, 1.5  # m/s: slower vehicles stand; from this speed on they have left
@@ -61,22 +64,26 @@ LANE = 1.8  # m to either side of a lane's middle
 ALIKE = 0.5  # rad
 BEFORE, BEYOND = 40.0, 3.0  # m before a line and beyond it, within which it concerns vehicles
 ONE_LINE = 5.0  # m along the lane, within which halts are at one line
+KNOWN, HALTING = 10.0, {"stop": 0.9, "yield": 0.4, "crossing": 0.4}  # vehicles, and the share that halts, by sign
+FRONT = 2.75  # m from a line of the map to the middle of a car that halts there
 LIKELY = 0.3  # probability of a halt from which vehicles come to a line
 
 
 @dataclass(frozen=True, eq=False)
 class Lines(Columns):
-    """k lines: position (k, 2), m, heading (k,), rad, counts (k,) of vehicles that halted and that crossed without."""
+    """k lines: position (k, 2), m, heading (k,), rad, counts (k,) of vehicles that halted and that crossed without, and
+    share (k,) that halts for nobody."""
 
     position: FloatArray
     heading: FloatArray
     halted: FloatArray
     crossed: FloatArray
+    alone: FloatArray
 
     @classmethod
     def none(cls) -> Lines:
         """No line."""
-        return cls(np.empty((0, 2)), np.empty(0), np.empty(0), np.empty(0))
+        return cls(np.empty((0, 2)), *np.empty((4, 0)))
 
     @property
     def probability(self) -> FloatArray:
@@ -92,16 +99,18 @@ class Lines(Columns):
         _, aside = ahead_and_aside(position[:, None] - self.position, unit(self.heading))
         return np.asarray((np.abs(aside) < LANE) & (np.abs(wrap_angle(heading[:, None] - self.heading)) < ALIKE))
 
-    def next_of(self, position: FloatArray, heading: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Distance (n,), m, of vehicles from the line that they come to, infinite: none, and how likely they halt."""
+    def next_of(self, position: FloatArray, heading: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Distance (n,), m, of vehicles from the line before them, infinite: none; shares that halt, and for nobody."""
+        none = np.zeros(len(position))
         if len(self) == 0:
-            return np.full(len(position), np.inf), np.zeros(len(position))
+            return none + np.inf, none, none
         ahead = -self.beyond(position)
         near = self.approached(position, heading) & (ahead < BEFORE) & (ahead > -BEYOND) & (self.probability > LIKELY)
         distance = np.where(near, ahead, np.inf)
         nearest, each = distance.argmin(axis=1), np.arange(len(position))
         found = distance[each, nearest]
-        return found, np.where(np.isfinite(found), self.probability[nearest], 0.0)
+        halts, alone = (np.where(np.isfinite(found), p[nearest], 0.0) for p in (self.probability, self.alone))
+        return found, halts, alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +128,19 @@ class HaltingPlaces:
         since = {node: then for node, then in self.since.items() if node not in nodes}
         beyond = {node: far for node, far in self.beyond.items() if node not in nodes}
         return HaltingPlaces(self.lines, since, frozenset(p for p in self.halted if p[0] not in nodes), beyond)
+
+    def with_lines(self, stop_lines: Iterable[StopLine], origin: FloatArray) -> HaltingPlaces:
+        """With the lines of a map that no light governs, in coordinates about `origin` (2,)."""
+        lines = self.lines
+        for line in stop_lines:
+            if not line.light:
+                across = line.ends[0] - line.ends[1]
+                n = max(1, round(float(np.hypot(*across)) / (2 * LANE)))
+                place = line.ends[1] - origin + (np.arange(n)[:, None] + 0.5) / n * across
+                share, heading = np.full(n, HALTING[line.sign]), np.full(n, line.heading)
+                counts, alone = (KNOWN * share, KNOWN * (1 - share) - 1), share * (line.sign == "stop")
+                lines = lines.append(Lines(place - FRONT * unit(heading), heading, *counts, alone))
+        return replace(self, lines=lines)
 
     def across(self, nodes: NodeTable, target: IntArray, source: IntArray) -> FloatArray:
         """(E,) probability that a line ends the edge from `source` to `target`, rows of nodes: halts between them."""
@@ -166,7 +188,7 @@ class HaltingPlaces:
         alike = lines.approached(position[None], np.array([heading]))[0]
         alike &= np.abs(lines.beyond(position[None])[0]) < ONE_LINE
         if not alike.any():
-            line = Lines(position[None], np.array([heading]), np.ones(1), np.zeros(1))
+            line = Lines(position[None], np.array([heading]), np.ones(1), *np.zeros((2, 1)))
             return replace(self, lines=lines.append(line), halted=self.halted | {(node, len(lines))})
         k = int(np.flatnonzero(alike)[0])
         if (node, k) in self.halted:

@@ -33,6 +33,7 @@ Hidden vehicles tell nothing.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
@@ -81,6 +82,8 @@ from saga_fg.types import (
     updated,
 )
 
+log = logging.getLogger(__name__)
+
 Element = TrafficLight | StopLine | Lane | Wall
 E = TypeVar("E", TrafficLight, StopLine, Lane, Wall)
 LABELS: Mapping[type, str] = {TrafficLight: LIGHT, StopLine: STOP_LINE, Lane: LANE, Wall: WALL}
@@ -120,7 +123,7 @@ def in_known_names(road_map: RoadMap, known: Mapping[str, Element]) -> RoadMap:
     def named(group: Iterable[E]) -> tuple[E, ...]:
         return tuple(replace(each, name=name[each.name]) for each in group)
 
-    lines = tuple(replace(line, light=name[line.light]) for line in named(road_map.stop_lines))
+    lines = tuple(replace(line, light=name.get(line.light, "")) for line in named(road_map.stop_lines))
     return replace(
         road_map,
         lights=named(road_map.lights),
@@ -172,6 +175,14 @@ def _dense(points: FloatArray) -> FloatArray:
     return np.stack([np.interp(at, distance, each) for each in points.T], axis=-1)
 
 
+def _crossed(line: StopLine, lanes: tuple[Lane, ...]) -> bool:
+    """False, with a warning, for a line without a light that none of the lanes crosses."""
+    if line.light or not lanes or len(LanesAcross.from_lanes(lanes, [line]).line):
+        return True
+    log.warning("stop line %s: no lane of the map crosses it; vehicles are not expected to halt there", line.name)
+    return False
+
+
 LONGEST = 1.0  # s between two detections of a vehicle
 
 Rule = TypeVar("Rule")
@@ -218,7 +229,7 @@ class FirstVehicles(Columns):
         if stop is None:
             return self
         first = stop.able(coming_vehicles(nodes).first())
-        first = first.select(first.target < len(detected))
+        first = first.select((first.target < len(detected)) & ((nodes.closed + nodes.open)[first.source] > 0))
         first = first.select(detected[first.target])
         v, ids, line = first.speed, nodes.id[first.target], nodes.id[first.source]
         ramp, braking = stop.brakes(nodes, first)
@@ -340,7 +351,8 @@ class MapNodes:
     def add(self, road_map: RoadMap, origin: FloatArray, joint: JointTrackState) -> RoadMap | None:
         """Add the new elements of a map to the nodes and to the joint state, whose positions are from `origin` (2,).
 
-        Returned is the map in the names that its elements have here; None where it is the latest one again.
+        Returned is the map in the names that its elements have here, with the new ones among its stop lines; None where
+        it is the latest one again. Stop lines without a light that no lane crosses are left out, with a warning.
         """
         if road_map is self._latest:
             return None
@@ -351,8 +363,9 @@ class MapNodes:
         if new:
             self._add_nodes(new, road_map.deviation, origin, joint)
         self._add_roads(road_map)
+        lines = tuple(line for line in road_map.stop_lines if line.name not in self._known)
         self._known = {each.name: each for each in elements(road_map)} | dict(self._known)
-        return road_map
+        return replace(road_map, stop_lines=tuple(line for line in lines if _crossed(line, road_map.lanes)))
 
     def _add_nodes(self, new: Sequence[Element], deviation: float, origin: FloatArray, joint: JointTrackState) -> None:
         """Add elements of a map of this deviation, m."""

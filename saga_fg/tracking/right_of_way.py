@@ -16,8 +16,8 @@ smoothed over `SMOOTHING` s. V, W are fitted to simulated crossings and merges o
 `python -m benchmarks right-of-way --fit`.
 
 Vehicles that are not detected are judged by where they are predicted. Such a vehicle waits with the probability P, the
-largest with which it yields, and its acceleration along its path is the mean of both, d m before its line and a where
-it goes on:
+largest of those with which it yields, or halts at a stop sign until `STAYS` s after its arrival. Its acceleration along
+its path is the mean of both, d m before its line and a where it goes on:
 
     a' = (1 - P) a - P min( v^2 / (2 d), `HARDEST` )
 """
@@ -49,6 +49,7 @@ ALIKE, HEAD_ON = 0.8, -0.9  # cosine between courses that come together, and of 
 LOOKS, AHEAD, FARTHEST = 25.0, 5.0, 60.0  # m, and s, for which paths are followed, to so many m
 CROSSING, JOINING = 5.0, 20.0  # m before a meeting point, where vehicles wait at unknown lines
 ARRIVES, SOON = 4.0, 0.5  # m before the line; s, in which a vehicle arrives at the earliest that has not
+STAYS = 3.0  # s from there until a vehicle that halts for nobody goes on
 AT_LINE, PASSED, HARDEST = 0.3, 1.0, 4.0  # m before and beyond a line, where vehicles stand and have left; m/s^2
 GOES, CRUISE, SLOW = 1.8, 10.0, 2.0  # m/s^2 and m/s of a vehicle that goes on freely; m/s
 
@@ -75,6 +76,7 @@ class RightOfWay:
     arrived      when they have arrived, s, by id
     probability  of each of `RELATIONS` from the first to the second, by ids
     line         place (2,), local, m, at which the first would wait for the second, by ids of those whose paths cross
+    halts        probability that vehicles halt at a line for nobody, and its place (2,), by id
     """
 
     time: float = -math.inf
@@ -82,6 +84,7 @@ class RightOfWay:
     arrived: Mapping[int, float] = field(default_factory=dict)
     probability: Mapping[Pair, tuple[float, ...]] = field(default_factory=dict)
     line: Mapping[Pair, FloatArray] = field(default_factory=dict)
+    halts: Mapping[int, tuple[float, FloatArray]] = field(default_factory=dict)
 
     def due(self, time: float) -> bool:
         """True if it is time for another judgement."""
@@ -93,12 +96,13 @@ class RightOfWay:
         arrived = {node: then for node, then in self.arrived.items() if node not in nodes}
         probability = {pair: p for pair, p in self.probability.items() if nodes.isdisjoint(pair)}
         line = {pair: place for pair, place in self.line.items() if nodes.isdisjoint(pair)}
-        return replace(self, motion=motion, arrived=arrived, probability=probability, line=line)
+        halts = {node: one for node, one in self.halts.items() if node not in nodes}
+        return replace(self, motion=motion, arrived=arrived, probability=probability, line=line, halts=halts)
 
     @cached_property
     def _waiting(self) -> dict[int, tuple[float, FloatArray]]:
         """Vehicles that may wait, by id: the probability, and the place (2,) of the line."""
-        found = dict[int, tuple[float, FloatArray]]()
+        found = dict(self.halts)
         for pair, place in self.line.items():
             if (p := self.probability.get(pair, (0.0,))[YIELDS]) > found.get(pair[0], (0.0,))[0]:
                 found[pair[0]] = p, place
@@ -150,7 +154,7 @@ class RightOfWay:
         speed = np.maximum(np.einsum("ni,ni->n", nodes.velocity[rows], unit(heading)), 0.0)
         motion = self._motion(ids, speed.tolist(), time)
         meetings, lead = _meetings(paths, nodes.position[rows], heading, speed)
-        to_line, halts = lines.next_of(nodes.position[rows], heading)
+        to_line, halts, alone = lines.next_of(nodes.position[rows], heading)
         usual = np.full(len(rows), np.inf)
         before = meetings.way - half[meetings.rows] - np.where(meetings.cosine > ALIKE, JOINING, CROSSING)[:, None]
         np.minimum.at(usual, meetings.rows, before)
@@ -165,10 +169,12 @@ class RightOfWay:
         columns = np.column_stack([half, speed, acceleration, to_line, halts, lead, arrival])
         pairs = [(ids[i], ids[j]) for i, j in meetings.rows.tolist()]
         crossing = np.flatnonzero(meetings.cosine <= ALIKE)  # those who come together do not halt
-        waits = meetings.rows[crossing, 0]
-        place = nodes.position[rows[waits]] + to_line[waits, None] * unit(heading[waits])
-        line = {pairs[k]: there for k, there in zip(crossing.tolist(), place, strict=True)}
-        return type(self)(time, motion, arrived, line=line), pairs, _evidence(meetings, columns)
+        place = nodes.position[rows] + np.minimum(to_line, FARTHEST)[:, None] * unit(heading)
+        line = {pairs[k]: place[meetings.rows[k, 0]] for k in crossing.tolist()}
+        stays = np.array([arrived.get(node, time) > time - STAYS for node in ids], dtype=np.bool_)
+        stops = np.flatnonzero((alone > 0) & (to_line < LOOKS) & stays)
+        halting = {ids[k]: (float(alone[k]), place[k]) for k in stops.tolist()}
+        return type(self)(time, motion, arrived, line=line, halts=halting), pairs, _evidence(meetings, columns)
 
     def _motion(self, ids: list[int], speed: list[float], time: float) -> dict[int, tuple[float, float]]:
         """Speed and smoothed acceleration of vehicles, by id."""

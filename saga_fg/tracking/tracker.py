@@ -182,6 +182,7 @@ class Tracker:
             named = None if road_map is None else state.map_nodes.add(road_map, state.origin, state.joint)
             if named is not None:
                 state.traffic.add_lanes(named.lanes)
+                state.halting = state.halting.with_lines(named.stop_lines, state.origin)
         state.joint.set_frame(frame, state.origin)
         predict_state(state, max(time, before))
         frame = state.ego.located(frame, state.world_T_ego)

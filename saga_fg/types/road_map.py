@@ -1,6 +1,7 @@
 """Road maps: lanes, walls, stop lines, the lights that control them, and the lanes across each line.
 
-Road maps: traffic lights, the stop lines they control, lanes and walls, in world coordinates.
+All are in world coordinates. A stop line without a light is that of a stop sign, of a yield sign or of a crossing of
+people: there `saga_fg.tracking.edge_record` expects vehicles to halt.
 
 A `Frame` may carry a map (`frame.road_map`), such as a tile along the drive, or the configuration holds one
 (`tracker.road_map`). Every element becomes a node of the scene graph: its place is a state with a standard deviation,
@@ -30,7 +31,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, Self
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 import scipy.linalg
@@ -57,15 +58,19 @@ class TrafficLight:
 
 
 @dataclass(frozen=True)
-class StopLine:
-    """A line where a red light stops traffic; `left` and `right` are its ends as approaching drivers see them."""
+class StopLine(Settings):
+    """A line where traffic halts or yields; `left` and `right` are its ends as approaching drivers see them."""
 
     name: str = required_setting("its name")
     left: Point = required_setting("left end (x, y), m")
     right: Point = required_setting("right end (x, y), m")
-    light: str = required_setting("name of the light that governs it")
+    light: str = setting("", "name of the light that governs it, if there is one")
+    sign: Literal["stop", "yield", "crossing"] = setting(
+        "stop", "without a light: stop or yield sign, or crossing of people; stop: more vehicles are expected to halt"
+    )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         _require_name(self.name)
         _require_points(f"stop line {self.name}: left, right", (self.left, self.right))
         if self.left == self.right:
@@ -118,7 +123,7 @@ class RoadMap(Settings):
     """Elements of the road with names of their own, and how well their places are known."""
 
     lights: tuple[TrafficLight, ...] = setting((), "traffic lights")
-    stop_lines: tuple[StopLine, ...] = setting((), "stop lines, each with the name of its light")
+    stop_lines: tuple[StopLine, ...] = setting((), "stop lines, with the names of their lights")
     lanes: tuple[Lane, ...] = setting((), "lanes")
     deviation: Positive = setting(0.2, "standard deviation of the positions in the map, m")
     walls: tuple[Wall, ...] = setting((), "walls, which pedestrians keep away from (edge rule repulsion)")
@@ -131,7 +136,7 @@ class RoadMap(Settings):
             raise InputError(f"road map: expected unique names, {twice!r} occurs twice")
         lights = {light.name for light in self.lights}
         for line in self.stop_lines:
-            if line.light not in lights:
+            if line.light and line.light not in lights:
                 raise InputError(f"stop line {line.name}: light: there is no traffic light {line.light!r} in the map")
 
     def __len__(self) -> int:

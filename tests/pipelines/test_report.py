@@ -348,6 +348,8 @@ def test_a_road_is_told_about_the_start_with_the_colours_last_reported():
     assert road["lines"] == [[0, 2000, 175, 2000, -175]]
     assert road["lights"] == [[3000, 0], [0, 4000]]  # what the later map says of "north" is not news
     json.dumps(road)
+    alone = RoadMap(stop_lines=(StopLine("sign", (120.0, 51.75), (120.0, 48.25)),))
+    assert scene_data(road_report(frame(0.0, road_map=alone)))["road"]["lines"] == [[-1, 2000, 175, 2000, -175]]
     green, red = 2, 0
     assert scene_data(SEEN)["road"]["colours"] == [[None, None], [None, None], [green, None], [red, None], [red, None]]
 

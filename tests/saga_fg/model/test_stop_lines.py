@@ -352,6 +352,7 @@ def test_a_map_that_makes_no_sense_is_refused(subtests):
         (lambda: RoadMap((), (StopLine("a", (0, 1), (0, 0), "b"),)), "there is no traffic light 'b'"),
         (lambda: RoadMap((TrafficLight("a", (0, 0)), TrafficLight("a", (1, 1)))), "'a' occurs twice"),
         (lambda: StopLine("a", (0, 1), (0, 1), "b"), "two different ends"),
+        (lambda: StopLine("a", (0, 1), (0, 0), sign="merge"), "sign: expected one of stop"),
         (lambda: Lane("a", ((0, 0),)), "at least two points"),
         (lambda: TrafficLight("", (0, 0)), "expected a name"),
         (lambda: TrafficLight("a", (0, math.nan)), "finite numbers"),

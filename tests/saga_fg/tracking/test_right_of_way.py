@@ -12,11 +12,11 @@ from saga_fg.tracking.edge_record import Lines
 from saga_fg.tracking.right_of_way import RightOfWay, free_time, probabilities
 from saga_fg.tracking.table_tracking import dense_traffic_settings
 from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings, paths
-from saga_fg.types import RELATIONS, RoadMap, StopLine, TrafficLight
+from saga_fg.types import RELATIONS, Lane, RoadMap, StopLine, TrafficLight
 
 EAST, NORTH = 0.0, np.pi / 2
 NOBODY_HALTS = Lines.none()
-HALTS_IN_THE_SOUTH = Lines(np.array([[0.0, -8.0]]), np.array([NORTH]), np.array([8.0]), np.array([0.0]))
+HALTS_IN_THE_SOUTH = Lines(np.array([[0.0, -8.0]]), np.array([NORTH]), np.array([8.0]), *np.zeros((2, 1)))
 
 
 def memory(*lines):
@@ -99,7 +99,7 @@ def test_oncoming_vehicles_do_not_meet():
 
 
 def test_where_nobody_ever_stops_lines_tell_nothing():
-    distance, halts = NOBODY_HALTS.next_of(np.zeros((2, 2)), np.zeros(2))
+    distance, halts, _ = NOBODY_HALTS.next_of(np.zeros((2, 2)), np.zeros(2))
     assert np.isinf(distance).all()
     assert (halts == 0).all()
     moments = [[(-40 + 1.6 * k, 0, EAST, 8.0), (0, -60 + 1.6 * k, NORTH, 8.0)] for k in range(10)]
@@ -108,7 +108,7 @@ def test_where_nobody_ever_stops_lines_tell_nothing():
 
 def test_the_next_line_is_that_of_ones_own_lane_and_direction():
     position, heading = np.array([[0.5, -20.0], [0.0, 8.0], [5.0, -20.0], [0.0, -20.0]]), [NORTH, NORTH, NORTH, EAST]
-    distance, halts = HALTS_IN_THE_SOUTH.next_of(position, np.array(heading))
+    distance, halts, _ = HALTS_IN_THE_SOUTH.next_of(position, np.array(heading))
     assert distance.tolist() == pytest.approx([12.0, np.inf, np.inf, np.inf])
     assert (halts > 0).tolist() == [True, False, False, False]
 
@@ -248,6 +248,56 @@ def test_a_stop_line_across_no_lane_changes_nothing():
         a, b = plain.step(one), mapped.step(other)
         assert np.array_equal(a.boxes.position, b.boxes.position)
         assert a.relations.rows() == b.relations.rows()
+
+
+STOP = StopLine("stop", (-1.75, 0.0), (1.75, 0.0))
+LAST = 30  # frames with detections
+
+
+def alone_until_hidden(road_map, steps=60):
+    """Places, m, of one car that comes from the south at 6 m/s, is hidden 12 m before the origin, and its tracker."""
+    tracker, found = Tracker(dense_traffic_settings()), []
+    for k in range(steps):
+        place = [(0.0, 0.6 * k - 30.0, 0.8)] if k < LAST else []
+        n = len(place)
+        boxes = Boxes.of(["car"] * n, place, [[4.5, 1.8, 1.6]] * n, [NORTH] * n)
+        tracks = tracker.step(Frame(0.1 * k, "lidar", Detections(boxes, np.full(n, 0.9)), road_map=road_map))
+        found.append(tracks.boxes.position[:1, 1])
+    return np.concatenate([np.empty(0), *found[LAST:]]), tracker
+
+
+def test_a_hidden_car_halts_at_a_stop_line_of_the_map_and_at_a_crossing_only_for_somebody():
+    free, stop, cross = (
+        alone_until_hidden(road)[0]
+        for road in (None, RoadMap(stop_lines=(STOP,)), RoadMap(stop_lines=(replace(STOP, sign="crossing"),)))
+    )
+    n = min(map(len, (free, stop, cross)))
+    assert n > 15
+    assert stop[n - 1] < free[n - 1] - 2.5
+    assert cross[:n] == pytest.approx(free[:n])
+
+
+def test_vehicles_tell_no_light_of_a_line_that_has_none():
+    road = RoadMap((TrafficLight("light", (52.0, 52.0)),), (STOP, StopLine("far", (50, 50), (54, 50), "light")))
+    _, tracker = alone_until_hidden(road, 20)
+    assert tracker.map_nodes.beliefs.keys() == {"light"}
+
+
+def test_each_lane_of_a_line_is_a_place_to_halt_and_maps_in_tiles_bring_it_once():
+    road = RoadMap(stop_lines=(StopLine("both", (-1.75, 0.0), (5.25, 0.0)),))
+    tracker = Tracker(dense_traffic_settings())
+    for frame, tile in zip(frames(2), (road, replace(road, deviation=0.3)), strict=True):
+        tracker.step(replace(frame, road_map=tile))
+    snapshot = tracker.snapshot()
+    assert (snapshot.halting.lines.position[:, 0] + snapshot.origin[0]).tolist() == pytest.approx([3.5, 0.0])
+    assert snapshot.halting.lines.probability.tolist() == pytest.approx([0.9, 0.9])
+
+
+def test_a_stop_line_without_light_across_no_lane_is_named_and_left_out(caplog):
+    road = RoadMap(stop_lines=(STOP,), lanes=(Lane("east", ((-50.0, 5.0), (50.0, 5.0))),))
+    _, tracker = alone_until_hidden(road, 3)
+    assert caplog.messages == ["stop line stop: no lane of the map crosses it; vehicles are not expected to halt there"]
+    assert len(tracker.snapshot().halting.lines) == 0
 
 
 def test_who_yields_goes_with_the_tracks_and_through_a_snapshot():
