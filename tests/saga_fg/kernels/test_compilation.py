@@ -67,8 +67,7 @@ def test_what_cannot_be_compiled_is_one_clear_line(tmp_path):
     assert "does not compile it" in out
 
 
-@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
-@pytest.mark.parametrize("content", [b"", b"\x80\x04damaged"])
+@pytest.mark.parametrize(("suffix", "content"), [("nbi", b""), ("nbc", b"\x80\x04damaged")])
 def test_a_damaged_file_of_kernels_is_told_with_its_folder_and_replaced(suffix, content, tmp_path):
     environment = {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
     run(LABELS, ROOT, **environment)

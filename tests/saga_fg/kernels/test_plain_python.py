@@ -10,11 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.config import load_config
+from saga_fg.estimators import JointKalmanFilter
 from saga_fg.kernels import compilation
 from saga_fg.kernels.compilation import Kernel
 from saga_fg.kernels.paths import path_meetings
-from tests.saga_fg.estimator_scenario import random_scenario
-from tests.saga_fg.kernels.test_kernels import played, random_frames, tracked
+from tests.saga_fg.estimator_scenario import random_scenario, tell
+from tests.saga_fg.kernels.test_kernels import random_frames
 
 compared: Counter[str] = Counter()
 
@@ -41,13 +42,16 @@ def both(self, *args, **named):
 @given(st.sampled_from(["nuscenes", "kitti", "traffic", "file"]), st.integers(0, 10_000))
 @settings(max_examples=8, deadline=None, derandomize=True)
 def track(family, seed):
-    tracked(random_frames(seed, frames=8), load_config(family))
+    tracker = load_config(family).new_tracker("saga")
+    for frame in random_frames(seed, frames=8):
+        tracker.step(frame)
 
 
 @given(st.integers(0, 10_000), st.sampled_from([{}, {"tolerance": 0.02, "max_component": 3}]))
 @settings(max_examples=4, deadline=None, derandomize=True)
 def play(seed, bounds):
-    estimator, _ = played(random_scenario(np.random.default_rng(seed), frames=4), bounds)
+    scenario = random_scenario(np.random.default_rng(seed), frames=4)
+    estimator = tell(JointKalmanFilter(**bounds), scenario.calls)
     for node in estimator.nodes:
         estimator.covariance([node])
 

@@ -74,7 +74,7 @@ def best_by_brute_force(cost, possible, unmatched):
     return best
 
 
-@given(st.integers(1, 4), st.integers(1, 4), st.data())
+@given(st.integers(0, 4), st.integers(0, 4), st.data())
 def test_the_assignment_is_the_best_of_all(n, m, data):
     cost = data.draw(arrays(np.float64, (n, m), elements=st.floats(-20, 20)))
     possible = data.draw(arrays(np.bool_, (n, m)))
@@ -86,27 +86,6 @@ def test_the_assignment_is_the_best_of_all(n, m, data):
     assert total(cost, unmatched, rows, columns) == pytest.approx(
         best_by_brute_force(cost, possible, unmatched), abs=1e-9
     )
-
-
-def test_a_pair_that_costs_more_than_none_is_left_out():
-    cost = np.array([[3.0, 9.0], [1.0, 2.0]])
-    everything = np.ones((2, 2), dtype=bool)
-    rows, columns = assign(cost, everything, 5.0)
-    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == [(0, 0), (1, 1)]
-    rows, columns = assign(cost, everything, 2.5)
-    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == [(1, 0)]
-    rows, columns = assign(cost, everything, np.array([[10.0], [0.5]]))
-    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == [(0, 0)]
-
-
-def test_greed_does_not_pay_and_nothing_is_possible_where_nothing_is(subtests):
-    """The cheapest pair first would leave the other track alone."""
-    rows, columns = assign(np.array([[1.0, 2.0], [1.5, 9.0]]), np.ones((2, 2), dtype=bool), 5.0)
-    assert list(zip(rows.tolist(), columns.tolist(), strict=True)) == [(0, 1), (1, 0)]
-    for shape in [(0, 0), (0, 3), (3, 0), (2, 3)]:
-        with subtests.test(shape=shape):
-            rows, columns = assign(np.zeros(shape), np.zeros(shape, dtype=bool), 5.0)
-            assert (len(rows), len(columns)) == (0, 0)
 
 
 # Pairwise costs: joint likelihoods of two associations, weighed so that nothing is counted twice

@@ -80,12 +80,6 @@ def test_rigid_transforms_are_accepted_and_undone_by_their_inverses(T):
     assert np.array_equal(checked_transform("world_T_ego", T), T)
 
 
-@given(transforms(), arrays(np.float64, (3, 3), elements=lengths))
-def test_points_there_and_back(T, points):
-    back = transform_points(inverse_transform(T), transform_points(T, points))
-    assert np.allclose(back, points, atol=1e-8)
-
-
 @given(st.floats(-3.14, 3.14), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
 def test_yaw_of_a_tilted_vehicle_is_that_of_its_nose(yaw, pitch, roll):
     R = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()

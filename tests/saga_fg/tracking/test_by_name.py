@@ -1,8 +1,6 @@
 """An estimator of a user's own: named by its module or an entry point, checked, and run by the tracker."""
 
-import copy
 import importlib
-import pickle
 import sys
 import textwrap
 from dataclasses import replace
@@ -13,7 +11,6 @@ import pytest
 from pipelines.configuration import read_settings
 from saga_fg import InputError, Tracker, TrackerSettings
 from saga_fg.conformance import check_estimator
-from saga_fg.estimators import GraphFilter, JointKalmanFilter
 from saga_fg.parts import offered
 from saga_fg.tracking import EgoNodeSettings
 from saga_fg.tracking.by_name import estimator_parameters
@@ -195,17 +192,6 @@ def test_a_subclass_is_what_runs(mine):
     assert (estimator.bounds.tolerance, estimator.bounds.most) == (0.02, 7)
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda tracker: pickle.loads(pickle.dumps(tracker))])
-def test_copies_and_snapshots_go_on_alike(copied):
-    tracker, told = Tracker(settings("my_estimators:Textbook")), frames()
-    run(tracker, told[:10])
-    twin, snapshot = copied(tracker), tracker.snapshot()
-    after = [columns(tracks) for tracks in run(tracker, told[10:])]
-    assert [columns(tracks) for tracks in run(twin, told[10:])] == after
-    tracker.restore(snapshot)
-    assert [columns(tracks) for tracks in run(tracker, told[10:])] == after
-
-
 def test_it_is_called_with_the_settings_that_its_parameters_name(mine):
     tracker = Tracker(settings("my_estimators:with_lag", lag=3.5, max_delay=0.2))
     estimator = tracker._state.joint.estimator
@@ -252,13 +238,6 @@ def test_one_line_says_what_is_wrong(subtests):
             assert str(raised.value).startswith("estimator: ")
             assert message in str(raised.value)
             assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize(
-    "make", [JointKalmanFilter, GraphFilter, lambda: GraphFilter(lag=1.0)], ids=["kalman", "isam2", "fixed-lag"]
-)
-def test_the_toolkits_estimators_conform(make):
-    check_estimator(make)
 
 
 def test_a_users_estimator_conforms(mine):

@@ -15,7 +15,6 @@ from saga_fg.model.edge_rules import Neighbours
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.nonlinear_interactions import SmoothDriver
 from saga_fg.model.scene_graph import Edges, NonlinearEdges, SceneGraph
-from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking.settings import TrackerSettings
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections, Frame
@@ -28,22 +27,6 @@ def frame(number, count=6):
         ["car"] * count, place, np.tile((4.0, 1.8, 1.6), (count, 1)), np.zeros(count), np.tile((1.0, 0.0), (count, 1))
     )
     return Frame(0.1 * number, "lidar", Detections(boxes, np.full(count, 0.9)), np.eye(4))
-
-
-def test_noise_without_which_no_measurement_can_be_taken_in(subtests):
-    for name in ["position", "velocity", "range_rate", "yaw"]:
-        for value in [0.0, -1.0, np.nan, np.inf]:
-            with subtests.test(name=name, value=value), pytest.raises(InputError, match=name):
-                NoiseModel(**{name: value})
-
-
-def test_boxes_that_cannot_be(subtests):
-    for column, value in [("position", np.nan), ("position", 1e300), ("size", -1.0), ("size", 0.0)]:
-        with subtests.test(column=column, value=value):
-            columns = {"position": np.zeros((1, 3)), "size": np.ones((1, 3))}
-            columns[column][0, 0] = value
-            with pytest.raises(InputError, match=column):
-                Boxes.of(["car"], **columns)
 
 
 class Rule(Neighbours):
@@ -71,21 +54,6 @@ def test_edges_by_rules_and_laws_of_users(subtests):
     for rule, error in [(Rule(SharedVelocity()), "rule Rule"), (Neighbours(Law()), "of Law: b")]:
         with subtests.test(error), pytest.raises(InputError, match=error):
             tracked_with(rule)
-
-
-def test_edges_that_cannot_be(subtests):
-    """Made by hand, edges and graphs are checked."""
-    for edges in [{"target": [9]}, {"rate": [-1.0]}, {"rate": [np.nan]}, {"A_self": np.eye(3)[None]}]:
-        with subtests.test(edges=edges):
-            given = {
-                "target": [0],
-                "source": [1],
-                "rate": [0.5],
-                "A_self": -np.eye(4)[None],
-                "A_other": np.eye(4)[None],
-            }
-            with pytest.raises(InputError):
-                SceneGraph([1, 2], (CAR, CAR), (Edges("shared", **given | edges, b=np.zeros((1, 4))),))
 
 
 NONLINEAR = NonlinearEdges(SmoothDriver(), [0], [1], [1.0], [4.0])

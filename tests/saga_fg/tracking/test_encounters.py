@@ -6,11 +6,6 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from benchmarks.recording_sets import chosen_sets
-from benchmarks.variants import contenders
-from data_tools.metrics import scene_metrics
-from pipelines.config import load_config
-from pipelines.tracking import track_scene
 from saga_fg import ConstantAcceleration, ConstantVelocity, RandomWalk, Tracker, TrackerSettings
 from saga_fg.kernels.tracks import association_marginals
 from saga_fg.model.edge_rules import Neighbours
@@ -292,11 +287,3 @@ def test_a_doubted_position_seen_from_an_estimated_pose_moves_its_track_by_its_s
         moved.append(state.kinematics().position - before)
     assert np.hypot(*moved[0][0]) > 0.03
     np.testing.assert_allclose(moved[1], 0.3 * moved[0], rtol=0.05)
-
-
-def test_fewer_identities_are_exchanged_in_a_crowd():
-    (recordings,) = chosen_sets("crowds", None, 2, "crowd-1")
-    found = contenders("traffic", load_config("traffic", None), "saga,hard association", ())
-    runs = [track_scene(recordings.scene("crowd-1"), one.config.new_tracker(one.method)) for one in found]
-    soft, hard = (scene_metrics(run.scene.ground_truth, run.tracks).switches for run in runs)
-    assert soft < 0.9 * hard

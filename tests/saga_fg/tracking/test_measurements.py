@@ -1,7 +1,5 @@
 """Measurements of a frame: in which frame, how certain, and with the vehicle's own node."""
 
-import copy
-import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -323,20 +321,6 @@ def test_the_vehicle_is_never_reported_and_a_node_of_the_graph():
     assert tracks.id.tolist() == [1]
     assert tracker.graph.nodes.tolist() == [1, 0]
     assert tracker.graph.edge_count > 0
-
-
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda t: pickle.loads(pickle.dumps(t))])
-def test_copies_go_on_alike_and_looking_ahead_changes_nothing(copied):
-    settings = TrackerSettings(classes=MODEL, estimator="isam2", ego=APART)
-    tracker = Tracker(settings, SENSORS, providers=[Odometry(START), Gps()])
-    frames = [told for told, _ in drawn(3, 12)]
-    for told in frames[:6]:
-        tracker.step(told)
-    twin = copied(tracker)
-    tracker.tracks(frames[6].timestamp + 0.5)
-    for told in frames[6:]:
-        a, b = tracker.step(told), twin.step(told)
-        assert b.boxes.position == pytest.approx(a.boxes.position, abs=1e-3)
 
 
 def test_the_vehicle_is_of_the_class_and_the_length_that_are_set():

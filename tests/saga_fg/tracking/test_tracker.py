@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 
 from saga_fg import (
-    ConstantAcceleration,
-    ConstantVelocity,
     Detection,
     Detections,
     Frame,
@@ -61,23 +59,6 @@ def test_a_single_car_is_one_track_from_beginning_to_end():
     assert last.boxes.yaw[0] == pytest.approx(np.arctan2(2, 10))
     assert last.score[0] == pytest.approx(0.9)
     assert last.coasting.tolist() == [0.0]
-
-
-def test_the_filter_is_better_than_the_detections_and_knows_how_good_it_is():
-    sensor = Sensor(noise={"default": NoiseModel(position=0.5)})
-    errors, detected, claimed = [], [], []
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        truth = straight(rng.normal(size=2) * 20, rng.normal(size=2) * 8)
-        frames = seen(rng, truth, TENTHS, noise=0.5, yaw=NAN)
-        tracker = Tracker(settings(motion=ConstantVelocity(acceleration_noise=0.05)), {"lidar": sensor})
-        tracks = run(tracker, frames)[-1]
-        errors.append(tracks.boxes.position[0, :2] - truth(tracks.timestamp)[0])
-        detected.append(frames[-1].detections.boxes.position[0, :2] - truth(tracks.timestamp)[0])
-        claimed.append(np.trace(tracks.position_covariance[0]))
-    mean_square = float(np.mean(np.sum(np.square(errors), axis=1)))
-    assert mean_square < 0.4 * np.mean(np.sum(np.square(detected), axis=1))
-    assert 0.3 < mean_square / np.mean(claimed) < 1.7
 
 
 def test_velocities_are_taken_in_or_unknown_along_the_heading():
@@ -204,29 +185,6 @@ def test_classes_do_not_mix():
     swapped = tracker.step(frame(0.1, [(0, 0), (0, 1)], label=["pedestrian", "car"]))
     assert swapped.boxes.label.tolist() == ["car", "pedestrian"]
     assert swapped.boxes.position[:, 1].tolist() == pytest.approx([1.0, 0.0], abs=0.5)
-
-
-def test_constant_velocity_and_constant_acceleration_side_by_side():
-    """A queue whose cars and trucks move by different models, coupled with each other."""
-    classes = {
-        "car": ClassSettings(motion=ConstantVelocity(1.0)),
-        "truck": ClassSettings(motion=ConstantAcceleration(0.5, fading_time=3.0)),
-    }
-    start = np.stack([-14.0 * np.arange(4), np.zeros(4)], axis=-1)
-    truth = lambda t: start + np.array([10.0 * t + 0.5 * t**2, 0.0])  # noqa: E731
-    label = ["car", "truck", "car", "truck"]
-    tracker = Tracker(TrackerSettings(classes))
-    history = run(tracker, seen(np.random.default_rng(0), truth, TENTHS, label=label))
-    assert history[-1].boxes.label.tolist() == label
-    assert history[-1].id.tolist() == [1, 2, 3, 4]
-    assert history[-1].boxes.position[:, :2] == pytest.approx(truth(TENTHS[-1]), abs=0.4)
-    assert tracker.graph.dims.tolist() == [4, 6, 4, 6]
-    pairs = {
-        (int(tracker.graph.dims[i]), int(tracker.graph.dims[j]))
-        for group in tracker.graph.edges
-        for i, j in zip(group.target, group.source, strict=True)
-    }
-    assert {(4, 6), (6, 4)} <= pairs
 
 
 def test_unknown_sensors_are_the_default_one_and_unknown_ranges_add_no_noise():

@@ -9,7 +9,6 @@ from saga_fg import (
     ConstantAcceleration,
     ConstantVelocity,
     Curvilinear,
-    Frame,
     InputError,
     Sensor,
     Tracker,
@@ -52,37 +51,6 @@ def test_a_hidden_member_of_a_platoon_is_carried_by_those_still_seen():
     without = np.mean([hidden_car_error((), seed) for seed in range(5)])
     assert without > 5.0, "the test would show nothing"
     assert with_graph < 0.5 * without
-
-
-def test_the_hidden_member_knows_that_it_is_less_certain_than_its_neighbours():
-    tracker = Tracker(TrackerSettings(**PATIENT))
-    free = Tracker(TrackerSettings(edges=(), **PATIENT))
-    rng = np.random.default_rng(0)
-    for t in np.arange(0.0, 5.0, 0.1):
-        position = braking_platoon(t) + 0.1 * rng.normal(size=(4, 2))
-        told = frame(t, position if t < 3.5 else position[[0, 1, 3]])
-        tracks, independent = tracker.step(told), free.step(told)
-    spread = tracks.position_covariance[:, 0, 0]
-    assert spread.argmax() == 2
-    assert spread[2] < independent.position_covariance[2, 0, 0]
-
-
-def test_without_edges_every_object_has_its_own_filter_exactly():
-    """Told together or each to a tracker of its own: the same numbers."""
-    truth = straight([(0, 0), (40, 5), (-60, -8)], [(8, 0), (5, 1), (0, 3)])
-    frames = seen(np.random.default_rng(7), truth, np.arange(0, 4, 0.1), yaw=np.nan, world_T_ego=np.eye(4))
-    classical = TrackerSettings(edges=())
-    together = run(Tracker(classical), frames)
-    for k in range(3):
-        alone = run(
-            Tracker(classical), [Frame(f.timestamp, f.sensor, f.detections.select([k]), f.world_T_ego) for f in frames]
-        )
-        for all_of_them, one in zip(together, alone, strict=True):
-            mine = all_of_them.select(all_of_them.id == k + 1)
-            expected, got = columns(one), columns(mine)
-            for told in (expected, got):
-                told.pop("id")
-            assert got == expected
 
 
 def test_a_node_that_dies_leaves_its_information_and_its_neighbours():
@@ -311,15 +279,6 @@ def test_what_a_better_sensor_overlooks_counts_only_while_that_does_not_look():
     assert len(tracker.step(frame(0.1, (10.0, 0.0), **here))) == 1, "the other sensor confirms it"
 
 
-def test_what_two_sensors_see_scores_higher_than_what_one_of_them_misses():
-    both, one = (10.0, 0.0), (10.0, 20.0)
-    tracker = Tracker(independent(), {"camera": Sensor()})
-    tracks = run(tracker, [frame(0.0, [both, one], "lidar", score=0.6), frame(0.02, both, "camera", score=0.6)])[-1]
-    near = np.argsort(tracks.boxes.position[:, 1])
-    assert tracks.score[near[0]] > 0.7
-    assert tracks.score[near[1]] < 0.5
-
-
 @pytest.mark.parametrize("method", ["kalman", "fixed-lag"])
 def test_tracks_live_on_the_other_sensor_while_one_is_out(method):
     rng = np.random.default_rng(4)
@@ -332,6 +291,3 @@ def test_tracks_live_on_the_other_sensor_while_one_is_out(method):
     last = history[-1]
     order = np.argsort(last.id)
     assert last.boxes.position[order, :2] == pytest.approx(truth(last.timestamp), abs=0.4)
-
-
-# A tracker goes on from a snapshot as if nothing had happened in between

@@ -10,7 +10,7 @@ from factors import ResidualFactors
 from saga_fg import ConstantAcceleration, ConstantVelocity, Curvilinear, Frame, InputError, Tracker, TrackerSettings
 from saga_fg.estimators import GraphFilter, JointKalmanFilter
 from saga_fg.estimators.reference import Gaussian, kalman_predict
-from saga_fg.graph import OBJECT, Additions, GraphError, GraphView
+from saga_fg.graph import OBJECT, Additions, GraphView
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.map_rules import RedLight
@@ -67,18 +67,6 @@ def test_a_provider_that_adds_nothing_changes_nothing(association):
     assert quiet.graph.edge_count > 0
 
 
-def test_a_users_factor_moves_what_the_tracker_reports():
-    plain, measured = Tracker(ISAM2), Tracker(ISAM2, providers=[Range()])
-    for f in frames():
-        without, told = plain.step(f), measured.step(f)
-    assert told.id.tolist() == without.id.tolist() == [1, 2, 3]
-    apart = [np.hypot(*(tracks.boxes.position[0, :2] - PLACE)) for tracks in (without, told)]
-    assert abs(apart[1] - 4.0) < 0.3 * abs(apart[0] - 4.0)
-    moved = np.abs(told.boxes.velocity - without.boxes.velocity).max(axis=1)
-    assert moved[1] > 1e-3, "neighbours share their velocity"
-    assert moved[2] < 1e-3 * moved[1], "that one is far away"
-
-
 def test_what_leads_to_no_provider_is_refused(subtests):
     with pytest.raises(
         InputError, match="providers: expected a factor provider with name, factors; it lacks name, factors, got int"
@@ -93,34 +81,6 @@ def test_what_leads_to_no_provider_is_refused(subtests):
     ]:
         with subtests.test(message), pytest.raises(InputError, match=message):
             Tracker(TrackerSettings(estimator="isam2", providers=(name,)))
-
-
-@pytest.mark.parametrize(
-    ("residual", "message"),
-    [
-        (lambda x: np.full((len(x), 1), np.nan), "provider faulty: .* on car 1 at 1.00 s.*expected a finite number"),
-        (lambda x: 1 / 0, "provider faulty: .*division by zero"),
-    ],
-)
-def test_a_faulty_factor_is_named_and_the_tracker_goes_on(residual, message):
-    class Faulty:
-        name = "faulty"
-        broken = False
-
-        def factors(self, view: GraphView) -> Additions:
-            rows = [[one.key] for one in view.now(OBJECT).values()]
-            given = ResidualFactors(rows, (4,), residual, [[1.0]], name="wrong")
-            return Additions(factors=[given]) if self.broken else Additions()
-
-    provider = Faulty()
-    tracker, untouched = Tracker(ISAM2, providers=[provider]), Tracker(ISAM2, providers=[Quiet()])
-    for t in (tracker, untouched):
-        run(t, frames()[:10])
-    provider.broken = True
-    with pytest.raises(GraphError, match=message):
-        tracker.step(frames()[10])
-    provider.broken = False
-    assert_same(tracker.step(frames()[10]), untouched.step(frames()[10]), 1e-6, 1e-4)
 
 
 def test_providers_from_the_configuration():

@@ -123,13 +123,6 @@ def test_corners_of_known_boxes():
     assert boxes.corners()[1] == pytest.approx(np.array([[-1, 2], [-1, -2], [1, -2], [1, 2]]))
 
 
-@given(tables(), st.floats(-5, 5))
-def test_corners_move_with_the_box(boxes, yaw):
-    T = yaw_transform(3.0, -4.0, 0.0, yaw)
-    expected = boxes.corners() @ T[:2, :2].T + T[:2, 3]
-    assert np.allclose(boxes.transformed(T).corners(), expected, equal_nan=True, atol=1e-6)
-
-
 @given(tables(), st.data())
 def test_rows_by_mask_by_index_and_by_slice_are_the_same(boxes, data):
     mask = data.draw(arrays(np.bool_, len(boxes)))
@@ -243,36 +236,6 @@ def test_overlaps_are_those_of_clipped_polygons_symmetric_and_bounded(a, b):
         value = function(a, b)[0]
         assert value == pytest.approx(function(b, a)[0], abs=1e-9)
         assert 0.0 <= value <= 1.0 + 1e-12
-
-
-@given(boxes, boxes, st.floats(-1000, 1000), st.floats(-1000, 1000), st.floats(-5, 5), st.floats(-4, 4))
-def test_does_not_depend_on_the_frame(a, b, x, y, z, yaw):
-    T = yaw_transform(x, y, z, yaw)
-    for function in (bev_iou, iou_3d):
-        moved = function(a.transformed(T), b.transformed(T))
-        assert moved == pytest.approx(function(a, b), abs=1e-7)
-
-
-@given(boxes)
-def test_a_box_is_identical_to_itself(a):
-    for function in (paired_bev_iou, paired_iou_3d):
-        assert function(a, a)[0] == pytest.approx(1.0, abs=1e-9)
-
-
-@given(boxes, boxes)
-def test_equals_sampling(a, b):
-    rng = np.random.default_rng(0)
-    points = a.position[0, :2] + rng.uniform(-0.5, 0.5, (4000, 2)) @ np.diag(a.size[0, :2]) @ rotation(a.yaw[0]).T
-    local = (points - b.position[0, :2]) @ rotation(b.yaw[0])
-    share = np.mean((np.abs(local) <= b.size[0, :2] / 2).all(axis=1))
-    size_a, size_b = np.prod(a.size[0, :2]), np.prod(b.size[0, :2])
-    iou = paired_bev_iou(a, b)[0]
-    common = iou / (1 + iou) * (size_a + size_b)
-    assert common / size_a == pytest.approx(share, abs=5 * 0.5 / math.sqrt(4000))
-
-
-def rotation(yaw):
-    return np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
 
 
 def test_all_pairs_are_the_pairs_one_by_one():
