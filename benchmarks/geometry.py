@@ -201,7 +201,7 @@ def _places(seed: int) -> tuple[list[_Pair], list[FloatArray]]:
         transform_points(T, one.points.mean(axis=0)[None])[0] for T, one in zip(frames, result.submaps, strict=True)
     ]
     for (a, old), (b, new) in combinations(enumerate(result.submaps), 2):
-        if new.way[0] - old.way[1] > _APART and np.linalg.norm(middles[a] - middles[b]) < _NEAR:
+        if new.travelled[0] - old.travelled[1] > _APART and np.linalg.norm(middles[a] - middles[b]) < _NEAR:
             pairs.append((old.points.astype(np.float64), new.points.astype(np.float64)))
             truths.append(inverse_transform(frames[a]) @ frames[b])
     return pairs, truths

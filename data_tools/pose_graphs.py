@@ -52,7 +52,7 @@ from saga_fg.types import MAX_POSITION
 
 _UNIT = 1e-3  # what the norm of a quaternion may be off 1
 _SLIGHT = 1e-4  # share of the largest eigenvalue by which the smallest may be negative: four digits are rounded so
-_LEAST = 1e-9  # share of the largest eigenvalue that it is then raised to
+_MIN_SHARE = 1e-9  # share of the largest eigenvalue that it is then raised to
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def _definite(edges: TextTable, matrix: FloatArray) -> FloatArray:
     if len(near):
         example = edges.fault(int(near[0]), f"smallest eigenvalue {smallest[near[0]]:.3g}")
         log.warning("%s; so of %d information matrices, which are made positive definite", example, len(near))
-        raised = np.maximum(values[near], _LEAST * largest[near, None])
+        raised = np.maximum(values[near], _MIN_SHARE * largest[near, None])
         matrix[near] = (vectors[near] * raised[:, None]) @ vectors[near].swapaxes(1, 2)
     return matrix
 

@@ -45,7 +45,7 @@ _COLUMNS: Mapping[SensorName, tuple[str, ...]] = {
     "gps": _AXES,
 }
 _GEODETIC = ("latitude", "longitude", "altitude")
-_MOST = {"latitude": math.radians(85.0), "longitude": math.radians(180.0), "altitude": 1e5}  # rad and m; others: 1e15
+_MAX = {"latitude": math.radians(85.0), "longitude": math.radians(180.0), "altitude": 1e5}  # rad and m; others: 1e15
 _log = logging.getLogger(__name__)
 _HEADER = re.compile(r"\s*([A-Za-z_]+)\s*\[\s*([^\]]*?)\s*\]\s*")
 
@@ -86,7 +86,7 @@ def read_sensor_log(
             raise InputError(f"{path}: line {number}: expected {len(titles)} columns, got {len(row)}")
     table = TextTable.from_rows(path, [row for _, row in rows], [number for number, _ in rows], len(titles))
     units = [_UNITS[name][found[name][1]] for name in wanted]
-    most = tuple(_MOST[name] / unit if name in _MOST else LARGEST for name, unit in zip(wanted, units, strict=True))
+    most = tuple(_MAX[name] / unit if name in _MAX else LARGEST for name, unit in zip(wanted, units, strict=True))
     numbers = table.numbers([found[name][0] for name in wanted], wanted, most) * units
     time = numbers[:, 0]
     refuse(

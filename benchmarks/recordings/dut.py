@@ -22,7 +22,7 @@ from saga_fg.errors import InputError
 RATE = 23.98  # frames a second
 SIZES = {"veh": ("car", 4.5, 1.8), "ped": ("pedestrian", 0.6, 0.6)}
 COLUMNS = {"veh": ("x_est", "y_est", "psi_est", "vel_est"), "ped": ("x_est", "y_est", "vx_est", "vy_est")}
-_MOST = 10_000_000  # frames
+_MAX_FRAME = 10_000_000  # frames
 _LARGEST = 1e6  # m, rad, m/s
 
 
@@ -36,7 +36,7 @@ def dut_clips(root: Path) -> Recordings:
         parts, sizes = [], {}
         for kind, columns in COLUMNS.items():
             table = named_columns(*text_of(root, (f"{name}_{kind}.csv.gz",)), ("id", "frame", *columns))
-            time = table.integers(1, "frame", 0, _MOST) / RATE
+            time = table.integers(1, "frame", 0, _MAX_FRAME) / RATE
             states = table.numbers(slice(2, None), columns, _LARGEST)
             for one in np.unique(table.values[:, 0]).tolist():
                 own = np.flatnonzero(table.values[:, 0] == one)
@@ -51,6 +51,6 @@ def dut_clips(root: Path) -> Recordings:
                 sizes[f"{kind} {one}"] = SIZES[kind]
                 parts.append((moment, np.full(len(moment), f"{kind} {one}"), np.stack([x, y], 1), velocity.T, yaw))
         k, who, place, velocity, yaw = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return on_grid(f"{root}: {name}", k - k.min(initial=_MOST), who, (place, velocity, yaw), sizes)
+        return on_grid(f"{root}: {name}", k - k.min(initial=_MAX_FRAME), who, (place, velocity, yaw), sizes)
 
     return Recordings(tuple(names), read)

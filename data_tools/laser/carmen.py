@@ -205,15 +205,15 @@ def without_jumps(log: LaserLog, largest_speed: float) -> tuple[FloatArray, int]
     """
     wheels = transforms(log.odometry)
     step = np.linalg.inv(wheels[:-1]) @ wheels[1:]
-    way, seconds = np.hypot(step[:, 0, 2], step[:, 1, 2]), np.maximum(np.diff(log.time), 0.0)
-    jumps = np.flatnonzero(way > largest_speed * seconds + _SLACK)
+    travelled, seconds = np.hypot(step[:, 0, 2], step[:, 1, 2]), np.maximum(np.diff(log.time), 0.0)
+    jumps = np.flatnonzero(travelled > largest_speed * seconds + _SLACK)
     if not len(jumps):
         return log.odometry, 0
     first = int(jumps[0])
     _log.warning(
         "scan %d: the wheels moved %.3g m in %.3g s, more than largest_speed, %g m/s, allows; "
         "so in %d steps, which count as standing still",
-        first + 2, way[first], seconds[first], largest_speed, len(jumps),
+        first + 2, travelled[first], seconds[first], largest_speed, len(jumps),
     )  # fmt: skip
     for row in jumps.tolist():  # what follows moves by what the jump did
         wheels[row + 1 :] = wheels[row] @ np.linalg.inv(wheels[row + 1]) @ wheels[row + 1 :]

@@ -221,7 +221,7 @@ class Submap:
     keyframes          numbers of its first keyframe, the anchor, which carries the frame, and of the one after its last
     anchor_T_submap    (4, 4) the frame in that of the anchor's sensor, z up
     points             (N, 3) float32, m, in the submap's frame
-    way                m driven since the start of the drive, at its first and at its last keyframe
+    travelled          m driven since the start of the drive, at its first and at its last keyframe
 
     Raises `InputError` for points that are not finite.
     """
@@ -229,7 +229,7 @@ class Submap:
     keyframes: tuple[int, int]
     anchor_T_submap: FloatArray
     points: npt.NDArray[np.float32]
-    way: tuple[float, float]
+    travelled: tuple[float, float]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "anchor_T_submap", checked("anchor_T_submap", self.anchor_T_submap, (4, 4)))

@@ -159,7 +159,7 @@ KITTI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
 _FLOATS = ("<f4", "<f8", ">f4")
 _WIDTHS = range(3, 9)  # floats of a point
 _SAMPLE = 30_000  # numbers that tell the layout
-_LARGEST, _LEAST, _GARBAGE = 1e7, 1e-12, 0.01  # sizes of numbers, and the share beyond and below that is garbage
+_MAX_SIZE, _MIN_SIZE, _GARBAGE = 1e7, 1e-12, 0.01  # sizes of numbers, and the share beyond and below that is garbage
 _UNLIKE = 0.05  # of log deviations that differ; within it the fewest columns are taken
 _FEW = 100  # points
 
@@ -183,7 +183,7 @@ def columns_of_records(content: bytes) -> Columns:
                 table = np.frombuffer(content, dtype=kind).reshape(-1, width)[: _SAMPLE // width].astype(np.float64)
                 table = table[np.isfinite(table).all(axis=1)]
                 size = np.abs(table)
-                if not size.size or ((size > _LARGEST) | ((size > 0) & (size < _LEAST))).mean() > _GARBAGE:
+                if not size.size or ((size > _MAX_SIZE) | ((size > 0) & (size < _MIN_SIZE))).mean() > _GARBAGE:
                     break
                 spread = np.log(table.std(axis=0) + 1e-3)
             if np.ptp(spread) > _UNLIKE:  # else each column is a mixture
@@ -392,7 +392,7 @@ def _arrays(path: Path) -> Columns:
     return columns
 
 
-_LAS_HEADER, _LEAST_LAS, _LAS_RECORD = 247, 227, 54  # bytes: checked of a header, of the shortest one, of a record
+_LAS_HEADER, _MIN_SIZE_LAS, _LAS_RECORD = 247, 227, 54  # bytes: checked of a header, of the shortest one, of a record
 
 
 def _las(path: Path) -> Columns:
@@ -402,7 +402,7 @@ def _las(path: Path) -> Columns:
         header, size = file.read(_LAS_HEADER).ljust(_LAS_HEADER, b"\0"), file.seek(0, SEEK_END)
     start, records = struct.unpack_from("<II", header, 96)
     extended = struct.unpack_from("<I", header, 243)[0] if header[25] >= 4 else 0
-    if header[:4] != b"LASF" or not _LEAST_LAS <= start <= size or _LAS_RECORD * (records + extended) > size:
+    if header[:4] != b"LASF" or not _MIN_SIZE_LAS <= start <= size or _LAS_RECORD * (records + extended) > size:
         raise InputError(f"expected a header of LAS, with its records in the {size} bytes of the file")
     return dict(isolated("expected a file that laspy can read", _las_columns, path))
 

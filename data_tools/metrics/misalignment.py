@@ -15,7 +15,7 @@ from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.types import Scene
 
 _GATE = 2.0  # m, from which a pair cannot match
-_LEAST = 0.1  # recall from which AMOTA counts what matches
+_MIN_RECALL = 0.1  # recall from which AMOTA counts what matches
 _EXPLAINED, _BETTER = 0.5, 2.0  # share of boxes that a reading matches, and how many times what matches as given
 _CLEAR = 0.6  # share of the pairs with an offset that another one may have, as along a row of parked cars
 _OBJECTS, _MOMENTS = 5, 5  # objects that it matches, and moments at which one track matches an object
@@ -53,7 +53,7 @@ def misalignment(scenes: Sequence[tuple[Scene, SceneBoxes]]) -> str:
     best = max(shares.values())
     if best < max(_EXPLAINED, _BETTER * given):
         none = "hardly a track is near a true object; no usual unit, turn, offset or shift in time explains it"
-        return none if reach < _LEAST else ""
+        return none if reach < _MIN_RECALL else ""
     how = next(how for how, share in shares.items() if share > best - 0.02)  # the plainest of those that fit alike
     return f"tracks match {given:.0%} of the boxes for long; {how}, they would match {shares[how]:.0%}"
 

@@ -39,7 +39,7 @@ LEAST = np.diag([1e-4] * 3 + [5e-3] * 3) ** 2  # of a motion: the best accuracy 
 class Drive:
     """Odometry of a drive that goes on, scan by scan.
 
-    times (K), s; poses K times (4, 4) of the sensor by odometry alone; ways (K), m, driven
+    times (K), s; poses K times (4, 4) of the sensor by odometry alone; travelled (K), m
     covariances  K times (6, 6) of the motion to each scan from the one before: (rotation, translation) in the frame of
                  the later one, rad^2, m^2
     keyframes    rows among the scans
@@ -47,7 +47,7 @@ class Drive:
     """
 
     def __init__(self) -> None:
-        self.times, self.ways = list[float](), list[float]()
+        self.times, self.travelled = list[float](), list[float]()
         self.poses, self.covariances = list[FloatArray](), list[FloatArray]()
         self.keyframes = list[int]()
         self.closed = False
@@ -75,7 +75,7 @@ class Drive:
         moved = float(np.linalg.norm(pose[:3, 3] - self.poses[-1][:3, 3])) if self.poses else 0.0
         self.times.append(time)
         self.poses.append(pose)
-        self.ways.append(moved + (self.ways[-1] if self.ways else 0.0))
+        self.travelled.append(moved + (self.travelled[-1] if self.travelled else 0.0))
         covariances = shared(self.poses, step)
         self.covariances[len(self.poses) - len(covariances) :] = covariances
 

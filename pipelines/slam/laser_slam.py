@@ -59,7 +59,7 @@ class Keyframe:
 
     points: FloatArray
     matched: FloatArray
-    way: float
+    travelled: float
     covariance: FloatArray
 
 
@@ -136,10 +136,10 @@ _DOUBT = 0.2  # share of a difference between wheels and registration that count
 _TURNING = 0.01  # error of the heading that registration in a turn makes, rad per rad
 KEYFRAME_STEP = 0.5  # distance between keyframes, m
 KEYFRAME_TURN = 0.5  # turn between keyframes, rad
-LOCAL_MAP = 10.0  # m of way whose keyframes scans are registered with
+LOCAL_MAP = 10.0  # m travelled whose keyframes scans are registered with
 ODOMETRY_DRIFT = 0.15  # error of the wheels, share of the way: standard deviation
 ODOMETRY_TURN = 0.1  # error of the wheels' heading, rad for each rad turned and for each 2 m driven: standard deviation
-_RADIAN = 1.0  # m of way that a radian of turning counts as
+_RADIAN = 1.0  # m travelled that a radian of turning counts as
 
 
 class LaserOdometry:
@@ -163,13 +163,13 @@ class LaserOdometry:
         if first:
             self._last = self._at_keyframe = self.wheels
         rolled = self._rolled(self._last)
-        at, way, turn = self._at @ rolled, float(np.hypot(rolled[0, 2], rolled[1, 2])), abs(heading(rolled))
-        sigma = np.array([0.02 + ODOMETRY_DRIFT * way] * 2 + [0.01 + ODOMETRY_TURN * (turn + way / 2)])
+        at, travelled, turn = self._at @ rolled, float(np.hypot(rolled[0, 2], rolled[1, 2])), abs(heading(rolled))
+        sigma = np.array([0.02 + ODOMETRY_DRIFT * travelled] * 2 + [0.01 + ODOMETRY_TURN * (turn + travelled / 2)])
         covariance, keyframe, lost = np.diag(sigma**2), first, 0
-        still = way < _SCAN_STEP and turn < np.deg2rad(3)
+        still = travelled < _SCAN_STEP and turn < np.deg2rad(3)
         if len(points) >= LEAST_POINTS and (self._map is None or not still):
             if self._map is not None:
-                fit = self._registered(self._map, points, at, np.diag(sigma**-2.0), way, turn)
+                fit = self._registered(self._map, points, at, np.diag(sigma**-2.0), travelled, turn)
                 before, at = self._at, transform(fit.pose)
                 driven, P = np.linalg.inv(before) @ at, covariance_of(fit.information / SMEAR, at)
                 self.scale.update(float(rolled[0, 2]), float(driven[0, 2]), float(P[0, 0]))
@@ -193,16 +193,22 @@ class LaserOdometry:
         return np.asarray(step)
 
     def _registered(
-        self, local: LineMap, points: FloatArray, predicted: FloatArray, prior: FloatArray, way: float, turn: float
+        self,
+        local: LineMap,
+        points: FloatArray,
+        predicted: FloatArray,
+        prior: FloatArray,
+        travelled: float,
+        turn: float,
     ) -> Fit:
         """The pose in the local map, where the wheels, of information `prior`, and the scan agree on it."""
         scan = thinned(points, 0.05)
-        fit = local.fit(scan, vector(predicted), prior, reach=min(1.0, 0.3 + way))
+        fit = local.fit(scan, vector(predicted), prior, reach=min(1.0, 0.3 + travelled))
         if fit.share >= _POOR:
             return fit
         few = scan if len(scan) <= 200 else scan[:: len(scan) // 200 + 1]
         self._grid = self._grid or ScoreGrid.of(local.points)  # a fast turn, wheels that slipped, or much is new
-        found = self._grid.search(few, vector(predicted), min(0.2 + way / 2, _WIDEST), 0.1 + turn / 2, 0.4)
+        found = self._grid.search(few, vector(predicted), min(0.2 + travelled / 2, _WIDEST), 0.1 + turn / 2, 0.4)
         if found is None:
             return fit
         return max(fit, local.fit(scan, found.pose, 0.01 * prior, reach=0.3), key=lambda each: each.share)
@@ -216,13 +222,15 @@ class LaserOdometry:
         return np.asarray(covariance + np.diag(doubt**2))
 
     def _add_keyframe(self, points: FloatArray, at: FloatArray, covariance: FloatArray) -> None:
-        frames, way = self.keyframes, 0.0
+        frames, travelled = self.keyframes, 0.0
         if frames:
             since = np.linalg.inv(frames[-1].matched) @ at
-            way = frames[-1].way + float(np.hypot(*since[:2, 2])) + _RADIAN * abs(heading(since))
-        frames.append(Keyframe(thinned(points, 0.03), at, way, covariance))
+            travelled = frames[-1].travelled + float(np.hypot(*since[:2, 2])) + _RADIAN * abs(heading(since))
+        frames.append(Keyframe(thinned(points, 0.03), at, travelled, covariance))
         self._at_keyframe = self.wheels
-        recent = np.concatenate([moved(one.points, one.matched) for one in frames if one.way > way - LOCAL_MAP])
+        recent = np.concatenate(
+            [moved(one.points, one.matched) for one in frames if one.travelled > travelled - LOCAL_MAP]
+        )
         self._map, self._grid = LineMap.of(recent) if len(recent) >= LEAST_POINTS else None, None
 
 
@@ -230,10 +238,10 @@ _KNOWN_SHARE = 0.8  # m, half width of a window up to which a corridor may be re
 _UNSURE = 1.5  # m, half width from which a loop waits for another that agrees with it
 _ACROSS = 5.0  # m from the middle of a submap that it is searched from, besides the window
 _UNIQUE = 0.92  # share of the best score that a rival may have
-_LONGEST = 60.0  # m of way from which the search of headings does not grow
+_LONGEST = 60.0  # m travelled from which the search of headings does not grow
 _BENT = np.diag([0.0, 0.0, 0.003, 0.03, 0.03, 0.0]) ** 2  # rad^2 and m^2, of the submap that is searched
 _EVERY = 2  # keyframes of which one is searched for
-SUBMAP = 10.0  # m of way in a submap in which loops are searched
+SUBMAP = 10.0  # m travelled in a submap in which loops are searched
 
 
 class LaserLoops(LoopSearch):
@@ -245,7 +253,7 @@ class LaserLoops(LoopSearch):
         self._maps = dict[int, tuple[ScoreGrid, LineMap, FloatArray]]()  # of submaps, with their middles
 
     def found(
-        self, submap: Submap, older: IntArray, way: FloatArray, frames: FloatArray
+        self, submap: Submap, older: IntArray, travelled: FloatArray, frames: FloatArray
     ) -> list[tuple[LoopClosure, bool]]:
         first, end = submap.keyframes
         at, found = in_plane(frames), list[tuple[LoopClosure, bool]]()
@@ -255,7 +263,7 @@ class LaserLoops(LoopSearch):
         known = [number for number in older.tolist() if number in self._maps]
         for k in range(0, end - first, _EVERY):
             inner = motion(path[: k + 1], noise[1 : k + 1])
-            found += self._loops(first + k, inner, at, np.array(known, dtype=np.int64), way)
+            found += self._loops(first + k, inner, at, np.array(known, dtype=np.int64), travelled)
         points = submap.points[:, :2].astype(np.float64)
         middle = (inverse_transform(path[0]) @ path[len(path) // 2])[[0, 1, 3], 3]
         if len(points) >= LEAST_POINTS:
@@ -263,24 +271,24 @@ class LaserLoops(LoopSearch):
         return found
 
     def driven(self, submap: Submap) -> float:
-        return self._keyframes[submap.keyframes[1] - 1].way
+        return self._keyframes[submap.keyframes[1] - 1].travelled
 
     def _loops(
-        self, row: int, inner: Motion, at: FloatArray, older: IntArray, way: FloatArray
+        self, row: int, inner: Motion, at: FloatArray, older: IntArray, travelled: FloatArray
     ) -> list[tuple[LoopClosure, bool]]:
         """Loops of a keyframe to the nearest older submaps whose windows reach it; inner: since the submap began."""
         recent = self._keyframes[max(0, row - 4) : row + 1]
         source, found = thinned(joined(recent, recent[-1]), 0.2), list[tuple[LoopClosure, bool]]()
         if not len(older) or len(source) < LEAST_POINTS:
             return found
-        window, world = 0.5 + self._settings.loop_drift * way[older], at[-1] @ in_plane(inner[0])
+        window, world = 0.5 + self._settings.loop_drift * travelled[older], at[-1] @ in_plane(inner[0])
         middles = np.array([(at[number] @ self._maps[number][2])[:2] for number in older.tolist()])
         apart = np.linalg.norm(middles - world[:2, 2], axis=1)
         near = np.flatnonzero(apart < _ACROSS + window)
         near = near[np.argsort(apart[near])]
         for k in near[: 3 + int(window[near].min(initial=0.0))].tolist():
             number = int(older[k])
-            turn = np.deg2rad(5) + 0.01 * min(way[number], _LONGEST)
+            turn = np.deg2rad(5) + 0.01 * min(travelled[number], _LONGEST)
             measured = self._matched(number, row, source, np.linalg.inv(at[number]) @ world, window[k], float(turn))
             if measured is not None:
                 T, P = in_space(measured[0]) @ inverse_transform(inner[0]), covariance_in_space(measured[1]) + inner[1]
@@ -305,7 +313,7 @@ class LaserLoops(LoopSearch):
 
 
 _NEARBY = 3.0  # m between keyframes that see the same walls
-_GAP = 5.0  # m of way without a keyframe nearby, from which on it is another pass
+_GAP = 5.0  # m travelled without a keyframe nearby, from which on it is another pass
 _SHARED = 3  # keyframes in a row that share a map
 _MOST_PASSES = 4  # that a keyframe is registered with
 _PRIOR = np.diag([100.0, 100.0, 1000.0])  # information of the graph about where the other pass is
@@ -322,17 +330,17 @@ def registered_passes(
     found = list[tuple[int, int, FloatArray, FloatArray]]()
     maps: dict[int, LineMap] = {}
     places = poses[:, :2, 2]
-    way = np.array([frame.way for frame in frames])
+    travelled = np.array([frame.travelled for frame in frames])
     for row in range(len(poses)):
         apart = np.linalg.norm(places[:row] - places[row], axis=1)
-        others = np.flatnonzero((apart < _NEARBY) & (way[:row] < way[row] - 2 * LOCAL_MAP))
+        others = np.flatnonzero((apart < _NEARBY) & (travelled[:row] < travelled[row] - 2 * LOCAL_MAP))
         if not len(others):
             continue
-        runs = np.split(others, np.flatnonzero(np.diff(way[others]) > _GAP) + 1)
+        runs = np.split(others, np.flatnonzero(np.diff(travelled[others]) > _GAP) + 1)
         nearest = sorted((int(run[np.argmin(apart[run])]) for run in runs), key=lambda k: apart[k])
         for other in dict.fromkeys(near // _SHARED * _SHARED for near in nearest[:_MOST_PASSES]):
             if other not in maps:
-                around = [frame for frame in frames if abs(frame.way - way[other]) < LOCAL_MAP / 3]
+                around = [frame for frame in frames if abs(frame.travelled - travelled[other]) < LOCAL_MAP / 3]
                 maps[other] = LineMap.of(joined(around, frames[other]))
             guess = np.linalg.inv(poses[other]) @ poses[row]
             fit = maps[other].fit(frames[row].points, vector(guess), _PRIOR, reach)
@@ -355,7 +363,7 @@ def _planar(graph: PoseGraph) -> PoseGraph:
 @dataclass(frozen=True, eq=False)
 class LaserPath:
     """poses (n, 3, 3) of the robot at each scan, matched: by scan matching alone; loops taken, rejected as false;
-    keyframes: their rows; graph: of these, with the measurements kept; wheel_scale: ways driven by those of the
+    keyframes: their rows; graph: of these, with the measurements kept; wheel_scale: distances travelled by those of the
     wheels; jumps: steps of the wheels too fast to believe.
     """
 

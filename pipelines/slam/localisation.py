@@ -63,7 +63,7 @@ from saga_fg.types import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 _REGISTERED = 6  # places for each search
 _MAX_RESIDUAL = 0.3  # largest mean distance of the points of a scan from the map, m
 _MIN_PAIRS = 0.4  # least share of the points of a scan that the map must have surfels for
-_RELOADED = 15.0  # m of way after which the surfels around are taken anew
+_RELOADED = 15.0  # m travelled after which the surfels around are taken anew
 MIN_OVERLAP = 0.5  # least share of what stands above the ground that scans and map have in common
 RADIUS = 80.0  # distance of the submaps around a place, m
 SCAN_SPACING = 1.5  # spacing of the points of a scan that is registered, m
@@ -147,7 +147,7 @@ _LOG = logging.getLogger(__name__)
 _GUESSED = np.diag([0.02, 0.02, 0.1, 1.0, 1.0, 0.5]) ** 2  # of a pose that was given or recognised
 _ACCURACY = np.diag([1e-3] * 3 + [0.03] * 3) ** 2  # of the map, rad and m
 ROBUST_SCALE = 3.0  # residual from which the Cauchy loss discounts a measured pose, deviations
-_COMPARED, _WINDOW = 5.0, 10.0  # m of way between comparisons of the structure, and of the scans compared
+_COMPARED, _WINDOW = 5.0, 10.0  # m travelled between comparisons of the structure, and of the scans compared
 _FIX_AGE = 60.0  # s, from which a fix says nothing of where the vehicle is; it is nearer than the way since, too
 
 
@@ -156,11 +156,13 @@ class LocaliserSettings(Settings):
     """Settings of localisation in a map."""
 
     odometry: OdometrySettings = settings_group(OdometrySettings, "LiDAR odometry")
-    search_way: Positive = setting(
-        15.0, "way whose points are looked for in the map, m; higher: surer, and later; usual 10 to 30"
+    search_distance: Positive = setting(
+        15.0, "distance travelled whose points are looked for in the map, m; higher: surer, and later; usual 10 to 30"
     )
     lag: NonNegative = setting(2.0, "time over which keyframes are smoothed, s; 0: a filter")
-    lost_after: Positive = setting(50.0, "way without a scan that fits after which the place is looked for again, m")
+    lost_after: Positive = setting(
+        50.0, "distance travelled without a scan that fits after which the place is looked for again, m"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,9 +223,9 @@ class Localiser:
         self._fits = set[int]()  # keyframes registered with the map
         self._unproved = list[int]()  # keyframes since the structure was compared
         self._clouds: list[tuple[int, FloatArray]] = []  # of the last keyframes, thinned, with their rows
-        self._searched, self._proved = 0.0, 0.0  # m, way of the last search, and of the last comparison
+        self._searched, self._proved = 0.0, 0.0  # m, distance at the last search, and of the last comparison
         self._smoother: IncrementalSmoother | None = None
-        self._last, self._fitted = 0, 0.0  # keyframe in the graph; way of the last fit, m
+        self._last, self._fitted = 0, 0.0  # keyframe in the graph; distance at the last fit, m
         self._pose, self._covariance = np.eye(4), _GUESSED  # of that keyframe
 
     def step(
@@ -245,7 +247,7 @@ class Localiser:
         self._path.add(time, placed.map_T_lidar, placed)
         row = len(self._path) - 1
         if gps is not None:
-            self._fix = time - gps.age, self.way, gps.position
+            self._fix = time - gps.age, self.travelled, gps.position
         points = placed.scan.points
         if placed.keyframe:
             self._clouds.append((row, points[voxel_downsample(points, 0.5)] if len(points) else points))
@@ -270,9 +272,9 @@ class Localiser:
         return self._path.carried(np.array([self._found[row][0] for row in rows]), rows)
 
     @property
-    def way(self) -> float:
+    def travelled(self) -> float:
         """Way by odometry, m."""
-        return self._path.ways[-1] if len(self._path) else 0.0
+        return self._path.travelled[-1] if len(self._path) else 0.0
 
     @property
     def ambiguous(self) -> bool:
@@ -288,7 +290,7 @@ class Localiser:
         if self._smoother is not None:
             self._consistency.observe(self._smoother.graph())
             self._compare()
-        if self._smoother is None and self._clouds and self.way > self._searched:
+        if self._smoother is None and self._clouds and self.travelled > self._searched:
             self._search(*self._clouds[-1])
         if (path := self.path()) is None:
             return None
@@ -320,7 +322,7 @@ class Localiser:
                 self._compare()
             else:
                 self._give_up("the first scan does not fit the map at the guess")
-        elif self.way - self._searched >= self.settings.search_way:
+        elif self.travelled - self._searched >= self.settings.search_distance:
             self._search(row, points)
 
     def _search(self, row: int, points: FloatArray) -> None:
@@ -331,7 +333,7 @@ class Localiser:
         found = None if fix is None else self._map.recognised(thin, fix)
         if found is None:
             found = self._map.recognised(thin)
-        self._searched = self.way
+        self._searched = self.travelled
         if found is None:
             self._clouds = self._clouds[len(self._clouds) // 2 :]
         else:
@@ -342,9 +344,9 @@ class Localiser:
         """The newest fix (2,) or (3,) by GPS, None once the vehicle may have left its surroundings."""
         if self._fix is None:
             return None
-        time, way, place = self._fix
+        time, travelled, place = self._fix
         age = self._path.times[self._clouds[-1][0]] - time
-        return place if age <= _FIX_AGE and self.way - way <= RADIUS / 2 else None
+        return place if age <= _FIX_AGE and self.travelled - travelled <= RADIUS / 2 else None
 
     def _seen(self) -> tuple[FloatArray, FloatArray]:
         """Points (N, 3) of the last keyframes, level, and their frame (4, 4) by odometry."""
@@ -355,10 +357,10 @@ class Localiser:
 
     def _begin(self, map_T_lidar: FloatArray) -> None:
         _LOG.info("place found at %s m", map_T_lidar[:3, 3].round(1).tolist())
-        self._smoother, self._fitted = IncrementalSmoother(lag=self.settings.lag), self.way
+        self._smoother, self._fitted = IncrementalSmoother(lag=self.settings.lag), self.travelled
         self._of_sensors = self._sensors.new_providers()
         self._pose, self._covariance = map_T_lidar, _GUESSED
-        self._proved = self.way
+        self._proved = self.travelled
 
     def _compare(self) -> None:
         """Give the place up if what stands above the ground around the last keyframes is not what the map has."""
@@ -366,21 +368,21 @@ class Localiser:
         if not len(query):
             return
         share = self._map.agreement(query, self._pose @ inverse_transform(self._path.poses[self._last]) @ frame)
-        self._proved = self.way
+        self._proved = self.travelled
         if share is not None and share < MIN_OVERLAP:
             self._give_up(f"{100 * share:.0f} % of what stands above the ground is as in the map")
         elif share is not None:
             self._unproved = []
 
     def _give_up(self, why: str) -> None:
-        _LOG.warning("at %.1f m: %s; the place is looked for", self.way, why)
+        _LOG.warning("at %.1f m: %s; the place is looked for", self.travelled, why)
         if self._unproved:
             self._consistency.forget(self._path.times[self._unproved[0]])
         for row in self._unproved:
             self._found.pop(row, None)
             self._fits.discard(row)
         self._unproved, self._smoother = [], None
-        self._searched = self._path.ways[self._clouds[0][0]]
+        self._searched = self._path.travelled[self._clouds[0][0]]
 
     def _add(self, row: int, points: FloatArray) -> bool:
         """Add a keyframe to the graph, registered with the map where it fits; returns whether it does."""
@@ -394,7 +396,7 @@ class Localiser:
             covariance = found.covariance + _ACCURACY + found.observed.open(LOST_TRANSLATION**2)
             seen = pose_prior_factor(key, found.map_T_scan, covariance, Robust("cauchy", ROBUST_SCALE))
             given.append(Given(Additions(factors=[seen]), "map"))
-            self._fitted = self.way
+            self._fitted = self.travelled
             self._fits.add(row)
         time = self._path.times[row]
         self._smoother.step(time, [*given, *self._of_sensors], self._sensors.frame(time))
@@ -404,10 +406,10 @@ class Localiser:
         self._last = row
         self._found[row] = self._pose, self._covariance
         self._unproved.append(row)
-        if self.way - self._fitted > s.lost_after:
+        if self.travelled - self._fitted > s.lost_after:
             self._give_up(f"no scan has fitted the map for {s.lost_after:.0f} m")
-        elif self.way - self._proved >= _COMPARED:
-            self._clouds = [one for one in self._clouds if self.way - self._path.ways[one[0]] <= _WINDOW]
+        elif self.travelled - self._proved >= _COMPARED:
+            self._clouds = [one for one in self._clouds if self.travelled - self._path.travelled[one[0]] <= _WINDOW]
             self._compare()
         return found is not None
 
@@ -446,7 +448,7 @@ def localise(
             "none was found" if guess is None else "the scans do not fit it at the guess, and elsewhere none was found"
         )
         raise InputError(
-            f"map: expected one that shows a place of this drive, {where} in {localiser.way:.0f} m of way; a longer "
+            f"map: expected one that shows a place of this drive, {where} in {localiser.travelled:.0f} m; a longer "
             "drive, or a guess good to a metre or two and 0.1 rad, may help"
         )
     return found

@@ -67,8 +67,8 @@ class Agreement:
     """Loops that wait for another one that agrees with them.
 
     within    largest difference of two loops that agree (2,), m and rad; `drift` (2,) more for each m between them
-    patience  m of way that a loop waits
-    apart     least way between the places that the two are found from, m
+    patience  m travelled while a loop waits
+    apart     least distance travelled between the places that the two are found from, m
     """
 
     within: FloatArray
@@ -78,19 +78,19 @@ class Agreement:
     _waiting: list[LoopClosure] = field(default_factory=list)
 
     def confirmed(
-        self, loop: LoopClosure, between: Callable[[int, int], FloatArray], way: Callable[[int], float]
+        self, loop: LoopClosure, between: Callable[[int, int], FloatArray], travelled: Callable[[int], float]
     ) -> Sequence[LoopClosure]:
         """The loop with those of before that agree with it; it waits if there are none.
 
-        between: pose of the second in the frame of the first, by odometry; way: driven until a pose, m
+        between: pose of the second in the frame of the first, by odometry; travelled: until a pose, m
         """
-        now = way(loop.second)
+        now = travelled(loop.second)
         agreed, waiting = list[LoopClosure](), list[LoopClosure]()
-        for other in (each for each in self._waiting if way(each.second) > now - self.patience):
-            far = abs(way(loop.first) - way(other.first)) + abs(now - way(other.second))
+        for other in (each for each in self._waiting if travelled(each.second) > now - self.patience):
+            far = abs(travelled(loop.first) - travelled(other.first)) + abs(now - travelled(other.second))
             one = between(other.first, loop.first) @ loop.first_T_second
             off = deviation(np.linalg.inv(one) @ other.first_T_second @ between(other.second, loop.second))
-            fits = now - way(other.second) >= self.apart and (off < self.within + self.drift * far).all()
+            fits = now - travelled(other.second) >= self.apart and (off < self.within + self.drift * far).all()
             (agreed if fits else waiting).append(other)
         self._waiting = waiting if agreed else [*waiting, loop]
         return [loop, *agreed] if agreed else []
@@ -141,7 +141,7 @@ _REGISTERED, _TAKEN = 4, 2  # places for each submap
 _ALIKE = 0.3  # correlation of images from which places are registered
 _SURELY = 0.75  # shared structure that a loop needs beyond the drift of odometry, with another that agrees
 _ALONE = 0.85  # and without one, up to twice the drift
-_FARTHEST = (35.0, 0.1)  # m, and m for each m of way: beyond, two places are not the same
+_FARTHEST = (35.0, 0.1)  # m, and m for each m travelled: beyond, two places are not the same
 _OPEN = 0.5  # m, standard deviation of an alignment of images
 DISTORTION = np.array([1e-3] * 3 + [0.05] * 3) ** 2  # rad^2 and m^2, of submaps, which are never quite straight
 
@@ -150,7 +150,7 @@ DISTORTION = np.array([1e-3] * 3 + [0.05] * 3) ** 2  # rad^2 and m^2, of submaps
 class LoopSettings(Settings):
     """Conditions for taking two submaps for one place."""
 
-    min_path: Positive = setting(60.0, "m of way between two submaps that are compared; 50 to 100")
+    min_path: Positive = setting(60.0, "m travelled between two submaps that are compared; 50 to 100")
     min_overlap: Fraction = setting(
         0.6, "share of what stands above the ground that two submaps have in common; raised: fewer, surer loops"
     )
@@ -171,7 +171,7 @@ class _Proved:
 class LoopSearch(ABC):
     """Submaps in, loops out: `found` says which older submaps show the place of a new one.
 
-    min_path: m of way between two submaps that are compared; waiting: loops that need another one
+    min_path: m travelled between two submaps that are compared; waiting: loops that need another one
     """
 
     def __init__(self, min_path: float, waiting: Agreement) -> None:
@@ -181,17 +181,17 @@ class LoopSearch(ABC):
 
     @abstractmethod
     def found(
-        self, submap: Submap, older: IntArray, way: FloatArray, frames: FloatArray
+        self, submap: Submap, older: IntArray, travelled: FloatArray, frames: FloatArray
     ) -> list[tuple[LoopClosure, bool]]:
         """Loops of a submap, and whether each waits for another one that agrees with it. Keep what the next need.
 
-        older: numbers of the submaps to compare with; way: from each submap so far along measurements, m; frames: of
-        all, as `add` has them
+        older: numbers of the submaps to compare with; travelled: from each submap so far along measurements, m;
+        frames: of all, as `add` has them
         """
 
     def driven(self, submap: Submap) -> float:
         """Way until the end of a submap, m, with which drift grows."""
-        return submap.way[1]
+        return submap.travelled[1]
 
     def add(self, submap: Submap, world_T_submap: FloatArray) -> Sequence[LoopClosure]:
         """Take the next submap and return loops, `first` and `second` numbers of submaps.
@@ -202,10 +202,10 @@ class LoopSearch(ABC):
         number = len(self._submaps)
         if number:
             self._edges.append((number - 1, number, self.driven(submap) - self.driven(self._submaps[-1])))
-        older = [k for k, one in enumerate(self._submaps) if one.way[1] <= submap.way[0] - self._min_path]
+        older = [k for k, one in enumerate(self._submaps) if one.travelled[1] <= submap.travelled[0] - self._min_path]
         self._submaps.append(submap)
         taken: list[LoopClosure] = []
-        for loop, waits in self.found(submap, np.array(older, dtype=np.int64), self._ways(number), world_T_submap):
+        for loop, waits in self.found(submap, np.array(older, dtype=np.int64), self._distances(number), world_T_submap):
             taken += self._confirmed(loop, world_T_submap) if waits else [loop]
         self._edges += [(loop.first, loop.second, float(deviation(loop.first_T_second)[0])) for loop in taken]
         return taken
@@ -214,11 +214,11 @@ class LoopSearch(ABC):
         agreed = self._waiting.confirmed(
             loop,
             lambda a, b: np.asarray(inverse_transform(frames[a]) @ frames[b]),
-            lambda number: self._submaps[number].way[1],
+            lambda number: self._submaps[number].travelled[1],
         )
         return [replace(loop, confirmed=True) for loop in agreed]
 
-    def _ways(self, number: int) -> FloatArray:
+    def _distances(self, number: int) -> FloatArray:
         """Way from each submap so far to this one, along measurements, m."""
         if not self._edges:
             return np.zeros(len(self._submaps))
@@ -236,12 +236,12 @@ class PlaceLoops(LoopSearch):
         self._index = PlaceIndex()
 
     def found(
-        self, submap: Submap, older: IntArray, way: FloatArray, frames: FloatArray
+        self, submap: Submap, older: IntArray, travelled: FloatArray, frames: FloatArray
     ) -> list[tuple[LoopClosure, bool]]:
         if len(submap.points) < FEWEST:
             return []
         number, image = len(frames) - 1, PlaceImage.of(submap.points.astype(np.float64))
-        proved = self._proved(number, image, older, way, frames)
+        proved = self._proved(number, image, older, travelled, frames)
         self._index.add(number, image)
         believed = list[tuple[LoopClosure, bool]]()
         for one in proved[:_TAKEN]:
@@ -254,12 +254,12 @@ class PlaceLoops(LoopSearch):
         return believed
 
     def _proved(
-        self, number: int, image: PlaceImage, older: IntArray, way: FloatArray, frames: FloatArray
+        self, number: int, image: PlaceImage, older: IntArray, travelled: FloatArray, frames: FloatArray
     ) -> list[_Proved]:
         """Loops of the submap, without rivals, the best first."""
         apart = np.linalg.norm(frames[older, :3, 3] - frames[number, :3, 3], axis=1)
-        length = self._submaps[number].way[1] - self._submaps[number].way[0]
-        older = older[apart < self._farthest(way[older]) + 2 * length + 20.0]
+        length = self._submaps[number].travelled[1] - self._submaps[number].travelled[0]
+        older = older[apart < self._farthest(travelled[older]) + 2 * length + 20.0]
         matches = self._index.candidates(image, older.tolist(), COMPARED)
         found = []
         for match in matches[:_REGISTERED]:
@@ -269,8 +269,8 @@ class PlaceLoops(LoopSearch):
             if loop is not None and overlap >= self.settings.min_overlap:
                 there = frames[loop.first] @ loop.first_T_second
                 off = float(np.linalg.norm(there[:3, 3] - frames[number, :3, 3]))
-                if off < self._farthest(way[match.number]):
-                    found.append(_Proved(loop, overlap, (off - 1.0) / (self.settings.drift * way[match.number])))
+                if off < self._farthest(travelled[match.number]):
+                    found.append(_Proved(loop, overlap, (off - 1.0) / (self.settings.drift * travelled[match.number])))
         return self._unrivalled(found, frames)
 
     def _registered(self, match: PlaceMatch, number: int) -> tuple[LoopClosure | None, float]:
@@ -291,14 +291,16 @@ class PlaceLoops(LoopSearch):
         trusted = [one for one in found if one.drift < 1]
         found = sorted(trusted or found, key=lambda one: -one.overlap)
         first = found[0].loop.first
-        ways = np.array([abs(self._submaps[one.loop.first].way[1] - self._submaps[first].way[1]) for one in found])
+        travelled = np.array(
+            [abs(self._submaps[one.loop.first].travelled[1] - self._submaps[first].travelled[1]) for one in found]
+        )
         places = np.array([(frames[one.loop.first] @ one.loop.first_T_second)[:3, 3] for one in found])
         overlap = np.array([one.overlap for one in found])
-        return [found[k] for k in agreeing(places, overlap, SAME + self.settings.drift * ways)]
+        return [found[k] for k in agreeing(places, overlap, SAME + self.settings.drift * travelled)]
 
     @staticmethod
-    def _farthest(way: FloatArray) -> FloatArray:
-        return _FARTHEST[0] + _FARTHEST[1] * way
+    def _farthest(travelled: FloatArray) -> FloatArray:
+        return _FARTHEST[0] + _FARTHEST[1] * travelled
 
 
 _LOG = logging.getLogger(__name__)
@@ -314,13 +316,17 @@ class Submaps:
         self.closed, self.loops = list[Submap](), list[LoopClosure]()  # loops are between keyframes
         self._spacing, self._search = spacing, search
         self._clouds: list[npt.NDArray[np.float32]] = []  # of the running submap's keyframes
-        self._way, self._begin, self._anchor_T_submap = 0.0, 0.0, np.eye(4)  # m; the way where it began, and its frame
+        self._travelled, self._begin, self._anchor_T_submap = (
+            0.0,
+            0.0,
+            np.eye(4),
+        )  # m; travelled when it began; its frame
 
     def add(self, points: FloatArray, world_T_sensor: FloatArray, driven: float) -> None:
-        """Add the points (N, 3) of the next keyframe; driven: way since the last, m."""
-        self._way += driven
+        """Add the points (N, 3) of the next keyframe; driven: m since the last."""
+        self._travelled += driven
         if not self._clouds:
-            self._anchor_T_submap, self._begin = upright(world_T_sensor), self._way
+            self._anchor_T_submap, self._begin = upright(world_T_sensor), self._travelled
         self._clouds.append(points[voxel_downsample(points, self._spacing)].astype(np.float32))
 
     def close(self, graph: SubmapGraph, poses: FloatArray) -> Submap | None:
@@ -330,8 +336,8 @@ class Submaps:
         anchor = len(poses) - len(self._clouds)
         inner = inverse_transform(poses[anchor]) @ poses[anchor:]
         points = placed_clouds(self._clouds, inverse_transform(self._anchor_T_submap) @ inner, self._spacing)
-        way = (self._begin, self._way)
-        submap = Submap((anchor, len(poses)), self._anchor_T_submap, points.astype(np.float32), way)
+        travelled = (self._begin, self._travelled)
+        submap = Submap((anchor, len(poses)), self._anchor_T_submap, points.astype(np.float32), travelled)
         self.closed.append(submap)
         self._clouds = []
         if self._search is not None:

@@ -198,7 +198,7 @@ LIDAR_FILES = (
     *("covariances.csv", "tracks.csv", "above.png", "metrics.json"),
 )
 _GAP = 2.0  # m between observed spans of a wall, beyond which two pieces of it are drawn
-_MOVES, _TELLING = 1.0, 10.0  # m/s; m of way that tell where ahead is
+_MOVES, _TELLING = 1.0, 10.0  # m/s; m travelled that tell where ahead is
 _ONE_WAY, _SIDEWAYS = 0.9, 20.0  # length of the mean direction; deg off the axis
 _log = logging.getLogger(__name__)
 
@@ -229,11 +229,11 @@ def metrics(result: SlamResult, scans: ScanSequence) -> dict[str, Any]:
 def _misplaced(path: Trajectory) -> dict[str, str]:
     """The LiDAR, with a warning, where the vehicle moves one way throughout that is neither ahead nor backwards."""
     steps = (inverse_transform(path.world_T_ego[:-1]) @ path.world_T_ego[1:])[:, :3, 3]
-    way = np.linalg.norm(steps, axis=1)
-    moves = way > _MOVES * np.diff(path.timestamps)
-    if way[moves].sum() < _TELLING:
+    travelled = np.linalg.norm(steps, axis=1)
+    moves = travelled > _MOVES * np.diff(path.timestamps)
+    if travelled[moves].sum() < _TELLING:
         return {}
-    mean = (steps[moves] / way[moves, None]).mean(axis=0)
+    mean = (steps[moves] / travelled[moves, None]).mean(axis=0)
     off = float(np.degrees(np.arccos(min(abs(mean[0]) / np.linalg.norm(mean), 1.0))))
     if np.linalg.norm(mean) < _ONE_WAY or off < _SIDEWAYS:
         return {}

@@ -42,7 +42,7 @@ _BELIEVED = 0.3  # share of a step by which registration may differ: beyond, whe
 
 @dataclass(eq=False)
 class WheelScale:
-    """Ratio of ways driven to those that the wheels tell, from steps that registration determines.
+    """Ratio of distances travelled to those that the wheels tell, from steps that registration determines.
 
     refused: steps of which the two differ too much to compare them
     """
@@ -282,8 +282,8 @@ def start_by_fixes(
 ) -> tuple[FloatArray, FloatArray]:
     """The first pose (4, 4) of the LiDAR in the world of fixes (n, 4): time, x, y, z, and its covariance (6, 6).
 
-    The path of the antenna (3,), by odometry over the first way, is laid on the fixes from above. Raises `InputError`
-    where these are too few, or the way too short.
+    The path of the antenna (3,), by odometry over the first metres, is laid on the fixes from above. Raises
+    `InputError` where these are too few, or too close together.
     """
     odometry, places = LidarOdometry(settings), list[FloatArray]()
     lidar_T_ego = inverse_transform(scans.ego_T_lidar)
@@ -297,10 +297,10 @@ def start_by_fixes(
     within = fixes[(fixes[:, 0] >= times[0]) & (fixes[:, 0] <= times[-1])]
     path = np.stack([np.interp(within[:, 0], times, axis) for axis in np.array(places).T], axis=1)
     if len(within) < _FEWEST_FIXES or np.linalg.norm(np.ptp(path[:, :2], axis=0)) < _SHORTEST:
-        way = float(np.linalg.norm(np.ptp(path[:, :2], axis=0))) if len(within) else 0.0
+        travelled = float(np.linalg.norm(np.ptp(path[:, :2], axis=0))) if len(within) else 0.0
         raise InputError(
             f"gps: expected {_FEWEST_FIXES} fixes over {_SHORTEST:g} m of the drive, which tell its heading, "
-            f"got {len(within)} over {way:.1f} m"
+            f"got {len(within)} over {travelled:.1f} m"
         )
     a, b = path - path.mean(axis=0), within[:, 1:] - within[:, 1:].mean(axis=0)
     yaw = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum()))

@@ -43,7 +43,7 @@ __all__ = [
 _LOG = logging.getLogger(__name__)
 _LONGEST = 0.5  # s that the first measurement stands for at most; the second one says how long its interval is
 _GAP = 3.0  # intervals like the one before, beyond which measurements are missing
-_NOTHING = 1e-9  # s
+_MIN_SPAN = 1e-9  # s
 
 
 class SensorBuffer:
@@ -106,7 +106,7 @@ class SensorBuffer:
         if silent and sensor not in self._silent:
             _LOG.warning("%s: no measurements for %.2f s before %.2f s", sensor, missing, until)
         (self._silent.add if silent else self._silent.discard)(sensor)
-        used = (spans > _NOTHING) & math.isfinite(since)
+        used = (spans > _MIN_SPAN) & math.isfinite(since)
         return spans[used], value[used]
 
     def _add(self, sensor: str, time: float, value: FloatArray) -> None:

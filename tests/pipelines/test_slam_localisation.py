@@ -28,8 +28,8 @@ PLAIN = LidarSlamSettings(landmarks=False, loop_closures=False, submaps=SubmapSe
 
 def drive(start: float, y: float, count: int, back: bool = False) -> np.ndarray:
     """A drive along the street at 10 m/s."""
-    way = start + (-1.0 if back else 1.0) * np.arange(count)
-    return np.array([yaw_transform(x, y, SENSOR_HEIGHT, np.pi if back else 0.02 * np.sin(x / 5)) for x in way])
+    travelled = start + (-1.0 if back else 1.0) * np.arange(count)
+    return np.array([yaw_transform(x, y, SENSOR_HEIGHT, np.pi if back else 0.02 * np.sin(x / 5)) for x in travelled])
 
 
 @pytest.fixture(scope="module")
@@ -209,11 +209,13 @@ def test_a_sensor_that_does_not_fit_is_named_in_a_map(
 
 
 @pytest.mark.parametrize(
-    ("way", "wait", "last"), [(8, 0.0, [True, False]), (50, 0.0, [False, False]), (8, 100.0, [False])]
+    ("travelled", "wait", "last"), [(8, 0.0, [True, False]), (50, 0.0, [False, False]), (8, 100.0, [False])]
 )
-def test_a_fix_counts_as_long_as_the_vehicle_is_near(known: SlamMap, way: int, wait: float, last: list[bool]) -> None:
+def test_a_fix_counts_as_long_as_the_vehicle_is_near(
+    known: SlamMap, travelled: int, wait: float, last: list[bool]
+) -> None:
     """Places are looked for around a fix, then everywhere; an old fix is forgotten, by way or by time."""
-    poses = drive(0.0, 0.5, way)
+    poses = drive(0.0, 0.5, travelled)
     scans, localiser, asked = (
         SimulatedScans(8, world_T_lidar=poses),
         Localiser(known, vehicle=Vehicle(sensors=["gps"])),
@@ -224,7 +226,7 @@ def test_a_fix_counts_as_long_as_the_vehicle_is_near(known: SlamMap, way: int, w
         asked.append(place is not None)
 
     localiser._map.recognised = recognised  # type: ignore[method-assign]
-    for k in range(way):
+    for k in range(travelled):
         fix = GpsFix(np.array([500.0, 0.0, 0.0])) if k == 0 else None
         localiser.step(scans[k], 0.1 * k + (wait if k > 5 else 0.0), gps=fix)
     localiser.finish()
@@ -233,7 +235,7 @@ def test_a_fix_counts_as_long_as_the_vehicle_is_near(known: SlamMap, way: int, w
 
 def test_where_the_map_has_no_such_place_none_is_found(known: SlamMap) -> None:
     scans = SimulatedScans(8, world_T_lidar=drive(0.0, 0.0, 24))
-    localiser = Localiser(known, settings=LocaliserSettings(search_way=10.0))
+    localiser = Localiser(known, settings=LocaliserSettings(search_distance=10.0))
     steps = [localiser.step(scans[k], 0.1 * k) for k in range(24)]
     assert all(step.map_T_lidar is None for step in steps)
     assert localiser.path() is None

@@ -46,8 +46,8 @@ from saga_fg.slam.pose_graph.graph import PoseGraph
 Product = Callable[[FloatArray], FloatArray]
 _ACCEPTED, _POOR, _GOOD = 0.05, 0.25, 0.9  # shares of the promised decrease: to take a step, to shrink, to grow
 _STEP_ROUNDING = 1e-13  # of the cost: differences below are noise
-_LEAST = 1e-11  # of the cost: a step that promises less, and does not hold it, meets rounding
-_LEAST_RADIUS = 1e-12
+_MIN_DECREASE = 1e-11  # of the cost: a step that promises less, and does not hold it, meets rounding
+_MIN_DECREASE_RADIUS = 1e-12
 _MOST_STEPS, _MOST_INNER = 200, 300
 
 
@@ -122,7 +122,7 @@ def best_frames(
     radius = np.sqrt(Y.shape[0] * Y.shape[1]) / 8
     products = 0
     for _ in range(_MOST_STEPS):
-        if here.slope <= tolerance * here.cost or radius < _LEAST_RADIUS or products >= most_products:
+        if here.slope <= tolerance * here.cost or radius < _MIN_DECREASE_RADIUS or products >= most_products:
             break
         step, promised, at_bound, count = _truncated_cg(here, radius, min(_MOST_INNER, most_products - products))
         products += count + 1
@@ -135,7 +135,7 @@ def best_frames(
             radius *= 2
         if ratio > _ACCEPTED:
             here, Y = there, there.Y
-        elif promised <= _LEAST * here.cost:
+        elif promised <= _MIN_DECREASE * here.cost:
             break
     here.products = products
     return here
@@ -178,7 +178,7 @@ _NEARLY = 1e-10  # the same for frames of more dimensions: slow where some are s
 _MOST_WORK = 5e9  # products with Q, times entries of its factors: half a minute in all, then the bound is a loose one
 _SHORTEST = 1e-8  # step along an eigenvector, of a length of sqrt(N d) in all
 _ACCURACY = 1e-4  # of an eigenvalue, relative to the shift
-_NOTHING = 1e-13  # cost that counts as none, relative to the trace of M: rounding, where all measurements agree
+_MIN_COST = 1e-13  # cost that counts as none, relative to the trace of M: rounding, where all measurements agree
 _LARGER = 10.0  # ratio of successive shifts, until no eigenvalue is below
 
 
@@ -237,7 +237,7 @@ def chordal_minimum(graph: PoseGraph, start: FloatArray) -> ChordalMinimum:
         found = min(found, descend(cost, rounded_rotations(frames.Y), most / 4), key=lambda each: each.cost)
         tested(found)
     bound, eigenvalue, dimensions = max(proofs)
-    least = found.cost if found.cost > _NOTHING * cost.M.trace() else 0.0
+    least = found.cost if found.cost > _MIN_COST * cost.M.trace() else 0.0
     return ChordalMinimum(_poses(graph, cost, found.Y), least, min(max(bound, 0.0), least), eigenvalue, dimensions)
 
 

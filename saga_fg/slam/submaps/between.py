@@ -65,7 +65,7 @@ from saga_fg.slam.pose_graph import PoseGraph, PosePriors, consensus, factor_gra
 from saga_fg.slam.pose_graph.chordal import factorised
 from saga_fg.slam.pose_graph.optimisation import SOLVER, chosen_edges, graph_values
 
-_NOTHING = 1e-3  # root of the information that counts as none: a deviation of 1000 m or rad
+_MIN_ROOT = 1e-3  # root of the information that counts as none: a deviation of 1000 m or rad
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class CondensedSubmap:
         rel = point.values.atPose3(self.anchor).between(point.values.atPose3(self.successor))
         columns = J.copy()
         columns[:, :6] += J[:, 6:12] @ rel.inverse().AdjointMap()  # of y: d(B) = d(rel) + Ad d(A)
-        if for_all_time or np.abs(columns[:, :6]).max(initial=0.0) >= _NOTHING:
+        if for_all_time or np.abs(columns[:, :6]).max(initial=0.0) >= _MIN_ROOT:
             return _factor([*keys, *for_all_time], *_compressed(columns), point, rel)
         R = np.linalg.qr(columns[:, 6:])[1]
         step, root = np.linalg.solve(R[:6, :6], R[:6, 6]), np.linalg.inv(R[:6, :6])
@@ -154,7 +154,7 @@ def _marginal(keys: Sequence[int], J: FloatArray, kept: Sequence[int], point: Li
     mine = np.concatenate([spans[key] for key in kept])
     others = np.setdiff1d(np.arange(start), mine)
     U, s, _ = np.linalg.svd(J[:, others], full_matrices=True)
-    rank = int((s > _NOTHING).sum())
+    rank = int((s > _MIN_ROOT).sum())
     rows: FloatArray = U[:, rank:].T @ J[:, [*mine, J.shape[1] - 1]]
     return rows
 
@@ -162,7 +162,7 @@ def _marginal(keys: Sequence[int], J: FloatArray, kept: Sequence[int], point: Li
 def _compressed(J: FloatArray) -> tuple[FloatArray, FloatArray]:
     """W and c with || W y - c || = || J y - b || but for a constant; J: [J | b]."""
     U, s, Vt = np.linalg.svd(J[:, :-1], full_matrices=False)
-    kept = s > _NOTHING
+    kept = s > _MIN_ROOT
     return s[kept, None] * Vt[kept], U[:, kept].T @ J[:, -1]
 
 
@@ -223,7 +223,7 @@ class Loops:
 
 
 _FALSE = 1e-3  # probability that a proven loop is false
-_MOST = np.log(1e3)  # log of the largest inflation
+_MAX_INFLATION = np.log(1e3)  # log of the largest inflation
 _STARTS = (1.0, 3.0, 10.0, 30.0)  # inflations with which loops are chosen
 _FIRST = PosePriors(np.zeros(1, dtype=np.int64), np.eye(4)[None], np.eye(6)[None])  # of the anchors, anywhere
 _SIMPLEX = np.array([[0.0, 0.0], [0.7, 0.0], [0.0, 0.7]])
@@ -324,9 +324,9 @@ class _AnchoredLoops:
             solutions.append(self.solved(kept, np.exp(logs), solutions.pop().values))
             return self.cost(solutions[0], kept, np.exp(logs))
 
-        simplex = np.clip(np.log(start) + _SIMPLEX, 0.0, _MOST)
+        simplex = np.clip(np.log(start) + _SIMPLEX, 0.0, _MAX_INFLATION)
         options = {**_PRECISION, "initial_simplex": simplex}
-        logs = minimize(cost, simplex[0], method="Nelder-Mead", bounds=[(0.0, _MOST)] * 2, options=options).x
+        logs = minimize(cost, simplex[0], method="Nelder-Mead", bounds=[(0.0, _MAX_INFLATION)] * 2, options=options).x
         total = cost(logs) + self.false_cost(solutions[0], np.flatnonzero(~kept))
         return LoopSelection(kept, np.exp(logs)), total
 

@@ -153,7 +153,9 @@ class Recorded:
 class SubmapSettings(Settings):
     """Size of submaps, association and confirmation of landmarks."""
 
-    length: Positive = setting(30.0, "way after which the next submap begins, m; usual 20 to 50; higher: slower")
+    length: Positive = setting(
+        30.0, "distance travelled after which the next submap begins, m; usual 20 to 50; higher: slower"
+    )
     confirm_after: Annotated[int, Range(1, 10**9)] = setting(4, "observations that confirm a landmark")
     relinearise_above: Positive = setting(
         0.5, "linearise factors again when a variable moved by this many standard deviations; higher: faster"
@@ -172,7 +174,7 @@ class SubmapSettings(Settings):
 
 _SOLVER = SolverSettings(tolerance=1e-4, max_iterations=30)
 _AFTER_LOOPS = RelinearisationSettings(0.01)  # deviations are those before the loop, which makes them smaller
-MAX_KEYFRAMES = 80  # keyframes after which the next submap begins, on a shorter way
+MAX_KEYFRAMES = 80  # keyframes after which the next submap begins, on a shorter distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +228,7 @@ class SubmapGraph:
         self._offsets: list[FloatArray] = []  # of keyframes from the anchors of their submaps, where that is closed
         self._loops: list[LoopClosure] = []  # between submaps, by their numbers
         self._landmarks = SubmapLandmarks()
-        self._numbers, self._way = 1, 0.0  # of the next landmark; m since the anchor
+        self._numbers, self._travelled = 1, 0.0  # of the next landmark; m since the anchor
 
     def __len__(self) -> int:
         return len(self._times)
@@ -246,8 +248,8 @@ class SubmapGraph:
         if (motion is None) != (k == 0):
             raise InputError("motion: expected one for every keyframe but the first")
         measured = self._motions[0] if motion is None else motion
-        way = self._way + (0.0 if motion is None else float(np.linalg.norm(measured[0][:3, 3])))
-        begins = k == 0 or way >= self.settings.length or k - self.anchors[-1] >= MAX_KEYFRAMES
+        travelled = self._travelled + (0.0 if motion is None else float(np.linalg.norm(measured[0][:3, 3])))
+        begins = k == 0 or travelled >= self.settings.length or k - self.anchors[-1] >= MAX_KEYFRAMES
         start = measured[0] if k == 0 else self.pose(k - 1) @ measured[0]
         landmarks = SubmapLandmarks() if begins else self._landmarks.copy()
         if motion is not None and not begins:
@@ -258,7 +260,7 @@ class SubmapGraph:
         starts = {n: one.kind.initialise(start, one.value) for n, one in now if n >= self._numbers}
         seen = LandmarkObservations({k: now}, starts, self.settings.robust)
         self.smoother.step(time, [motion_provider, seen, *self._providers], frame)
-        self._landmarks, self._way = landmarks, way
+        self._landmarks, self._travelled = landmarks, travelled
         self._numbers = max(self._numbers, *(n + 1 for n in numbers), 0)
         if k:
             self._motions.append(measured)
@@ -338,7 +340,7 @@ class SubmapGraph:
         if k:
             self._close(self.anchors[-1], k)
         self.anchors.append(k)
-        self._way = 0.0
+        self._travelled = 0.0
 
     def _close(self, anchor: int, successor: int) -> None:
         mine = {n for now in self.seen[anchor:successor] for n, _ in now}

@@ -200,9 +200,9 @@ def test_submaps_stand_upright_and_have_small_finite_points():
 # Places: the same one is found however it lies, and nothing is found where nothing is
 
 
-def submap(course: SimulatedCourse, way: float, length: float = 30.0) -> FloatArray:
+def submap(course: SimulatedCourse, travelled: float, length: float = 30.0) -> FloatArray:
     """Points of a piece of the drive, in the frame of its first scan."""
-    rows = np.flatnonzero((course.distance >= way) & (course.distance < way + length))[::8]
+    rows = np.flatnonzero((course.distance >= travelled) & (course.distance < travelled + length))[::8]
     back = inverse_transform(course.world_T_ego[rows[0]])
     return np.concatenate([transform_points(back @ course.world_T_ego[k], course[int(k)].points) for k in rows])
 
@@ -210,7 +210,7 @@ def submap(course: SimulatedCourse, way: float, length: float = 30.0) -> FloatAr
 @pytest.fixture(scope="module")
 def places() -> list[FloatArray]:
     course = SimulatedCourse(0, length=700.0, skewed=False)
-    return [submap(course, way) for way in np.arange(0.0, 660.0, 60.0)]
+    return [submap(course, travelled) for travelled in np.arange(0.0, 660.0, 60.0)]
 
 
 def test_a_place_is_found_turned_and_shifted(places, subtests):
