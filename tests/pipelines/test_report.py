@@ -226,13 +226,6 @@ def test_the_title_says_method_and_data_and_the_figures_what_is_known(folder):
     assert titles[-1].startswith("Time in the tracker")
 
 
-def test_tracks_of_own_data_are_drawn_when_the_page_opens(folder, tmp_path):
-    assert report(folder).exit_code == 0
-    page = (folder / "page.html").read_text(encoding="utf-8")
-    found = tried_in_browser(page, 'found.tracks = document.getElementById("view").dataset.tracks;', tmp_path)
-    assert found == {"faults": [], "tracks": "2"}
-
-
 def test_two_results_stand_side_by_side(folder):
     done = report(folder, "--beside", folder / "kf.csv")
     assert done.exit_code == 0, done.output

@@ -318,4 +318,4 @@ def test_a_file_of_settings_decides_about_dense_traffic(tmp_path):
     config.write_text("tracker: {min_hits: 2}\n")
     for options, told in (((), True), (("--config", str(config)), False), (("--method", "centerpoint"), False)):
         served = subprocess.run([*COMMAND, "serve", *options], input=stream, capture_output=True, check=True)
-        assert ("add --like dense" in served.stderr.decode()) == told
+        assert ("dense traffic: 6 vehicles at a time with headings, 10 Hz" in served.stderr.decode()) == told

@@ -82,7 +82,7 @@ def test_frames_that_were_held_are_sent_again(tmp_path):
         assert status(address)["taken"] == {"sensor": 12}
 
 
-def test_the_state_of_another_configuration_or_a_damaged_one_is_refused_and_stays(tmp_path, subtests):
+def test_the_state_of_another_configuration_is_refused_and_stays(tmp_path):
     state = tmp_path / "state"
     command = [*COMMAND, "serve", "--snapshot", str(state)]
     subprocess.run(command, input=frame(0), capture_output=True, check=True)
@@ -91,16 +91,6 @@ def test_the_state_of_another_configuration_or_a_damaged_one_is_refused_and_stay
     assert "'estimator: kalman' instead of 'estimator: isam2'" in said
     assert len(said.splitlines()) == 1
     assert state.read_bytes() == whole
-    for damaged, message in [
-        (whole[: len(whole) // 2], "the state file is damaged: its checksum differs; remove it to begin anew"),
-        (whole[:-9] + b"x" + whole[-8:], "the state file is damaged: its checksum differs; remove it to begin anew"),
-        (whole.replace(b"state 1", b"state 9", 1), "expected the format 'saga-fg state 1', got b'saga-fg state 9'"),
-        (b"", "expected a state file of `saga-fg serve`, this is none"),
-    ]:
-        with subtests.test(message):
-            state.write_bytes(damaged)
-            assert refused("serve", "--snapshot", state) == f"error: {state}: {message}\n"
-            assert state.read_bytes() == damaged
 
 
 def test_factors_of_ones_own_cannot_be_kept(tmp_path, monkeypatch):
@@ -162,13 +152,18 @@ def test_damage_anywhere_is_refused(tmp_path):
     path = tmp_path / "state.saga"
     write_state(path, HEADER, {"numbers": [1, 2.5, "x"]})
     whole = path.read_bytes()
-    for k in range(len(whole)):
-        path.write_bytes(whole[:k] + bytes([whole[k] ^ 1]) + whole[k + 1 :])
-        with pytest.raises(InputError, match=r"state\.saga: "):
+    flipped = [whole[:k] + bytes([whole[k] ^ 1]) + whole[k + 1 :] for k in range(len(whole))]
+    cases = [(damaged, "") for damaged in (*flipped, *(whole[:k] for k in range(len(whole))))]
+    cases += [
+        (whole[:-9], "the state file is damaged: its checksum differs; remove it to begin anew"),
+        (whole.replace(b"state 1", b"state 9", 1), "expected the format 'saga-fg state 1', got b'saga-fg state 9'"),
+        (b"", "expected a state file of `saga-fg serve`, this is none"),
+    ]
+    for damaged, message in cases:
+        path.write_bytes(damaged)
+        with pytest.raises(InputError, match=rf"state\.saga: {message}"):
             read_state(path, HEADER)
-        path.write_bytes(whole[:k])
-        with pytest.raises(InputError, match=r"state\.saga: "):
-            read_state(path, HEADER)
+        assert path.read_bytes() == damaged
 
 
 def test_another_configuration_is_refused_with_what_differs(tmp_path):

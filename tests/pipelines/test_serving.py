@@ -61,20 +61,6 @@ def test_what_looks_wrong_in_a_stream_is_told_once(caplog):
         assert told == (["scores are not from 0 to 1", "headings look like degrees"] if degrees else [])
 
 
-def test_dense_traffic_in_a_stream_is_told_where_nobody_said_how_to_track_it(caplog):
-    config = load_config("file")
-    for live_plain in (True, False):
-        checks = Checks(config, live_plain=live_plain)
-        service: StreamTracker[str] = StreamTracker(partial(config.new_tracker, "saga"), SETTINGS, checks)
-        caplog.clear()
-        for k in range(120):
-            cars = [{"label": "car", "x": 1.0 * k - 12 * n, "y": 4.0 * (n % 2), "yaw": 0.0} for n in range(10)]
-            answers(service, encode({"timestamp": 0.1 * k, "detections": cars}))
-        told = [record.getMessage() for record in caplog.records]
-        line = "dense traffic: 10 vehicles at a time with headings, 10 Hz, from a sensor that stands or hovers"
-        assert told == ([f"{line}; add --like dense"] if live_plain else [])
-
-
 def answers(service: StreamTracker[str], *lines: bytes) -> list[dict[str, Any]]:
     return [answer for line in lines for _, answer in service.handle(line, "me")]
 

@@ -21,7 +21,6 @@ from pipelines.slam.results import covered_spans, write_graph, write_lidar_slam
 from saga_fg import InputError
 from saga_fg.numerics import inverse_transform, yaw_transform
 from saga_fg.slam.submaps import LoopClosure, SubmapSettings
-from tests.pipelines.command import done
 
 
 @pytest.fixture(scope="module")
@@ -147,15 +146,6 @@ def test_what_cannot_be_placed_is_said() -> None:
     slam.step(scans[0], 0.0)
     with pytest.raises(InputError, match=r"time: expected one after 0\.000000 s, got 0\.000000 s"):
         slam.step(scans[1], 0.0)
-    with pytest.raises(InputError, match=r"points"):
-        Scan.of(np.full((5, 3), np.nan))
-    slam.step(scans[1], 0.1)
-    lost = slam.step(nothing, 0.2)  # goes on as before, uncertain
-    assert lost.odometry.registration is None
-    assert np.trace(lost.covariance) > 1.0
-    found = slam.step(scans[3], 0.3)
-    assert np.linalg.norm(found.world_T_lidar[:3, 3] - scans.world_T_ego[3, :3, 3]) < 0.5
-    assert len(slam.finish().trajectory.timestamps) == 4
 
 
 def test_every_file_is_written_and_read_back(scans: SimulatedScans, result: SlamResult, tmp_path: Path) -> None:
@@ -179,16 +169,6 @@ def test_every_file_is_written_and_read_back(scans: SimulatedScans, result: Slam
     assert json.loads((folder / "metrics.json").read_text()) == figures
     assert (folder / "above.png").read_bytes().startswith(b"\x89PNG")
     assert sorted(tmp_path.iterdir()) == [folder]
-
-
-def test_the_command_on_real_scans(recordings: Path, tmp_path: Path) -> None:
-    outcome = done("slam", "scans", recordings / "kitti", "--scans", "8", "--output", tmp_path / "run")
-    assert "8 scans" in outcome.stdout
-    assert "trajectory against the recording: ATE" in outcome.stdout
-    assert "odometry against the recording: ATE" in outcome.stdout
-    assert "no RPE on a path shorter than 10 m" in outcome.stdout
-    assert "nan" not in outcome.stdout
-    assert (tmp_path / "run" / "map.ply").is_file()
 
 
 def test_a_wall_is_drawn_where_it_was_seen() -> None:

@@ -123,7 +123,11 @@ def test_the_command_takes_records_and_tables(recordings: Path, tmp_path: Path) 
     table.write_text("time [s],speed [km/h]\n" + "".join(f"{0.1 * k:.1f},12.6\n" for k in range(1, 12)))
     options = [str(recordings / "kitti"), "--scans", "8", "--no-landmarks", "--sensors", "gps,imu"]
     command = ["slam", "scans", *options, "--sensor-log", f"wheels={table}", "--output", str(tmp_path / "run")]
-    done(*command)
+    said = done(*command).stdout
+    assert "trajectory against the recording: ATE" in said
+    assert "odometry against the recording: ATE" in said
+    assert "no RPE on a path shorter than 10 m" in said
+    assert "nan" not in said
     figures = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert figures["degenerate"] == []
     assert figures["trajectory"]["ate"] < 0.5

@@ -1,7 +1,7 @@
 """What is written in the layout of nuScenes is read again."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -308,19 +308,6 @@ def test_every_sample_needs_a_token(tmp_path, subtests):
             pytest.raises(InputError, match="expected a token of its own for every sample"),
         ):
             write_tracking_results(tmp_path / "out.json", [(scene(tokens=tokens), [tracks(), tracks()])], META)
-
-
-def test_interrupting_leaves_the_earlier_file(tmp_path):
-    def interrupted() -> Iterator[tuple[Scene, list[Tracks]]]:
-        yield scene(), [tracks(), tracks()]
-        raise KeyboardInterrupt
-
-    path = tmp_path / "out.json"
-    path.write_text("earlier")
-    with pytest.raises(KeyboardInterrupt):
-        write_tracking_results(path, interrupted(), META)
-    assert path.read_text() == "earlier"
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_broken_tracking_file(tmp_path, subtests):
