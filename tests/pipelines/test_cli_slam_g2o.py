@@ -130,13 +130,6 @@ def test_options_that_do_not_go_together(tmp_path: Path, subtests: pytest.Subtes
             assert message in refused(*arguments)
 
 
-def test_a_broken_file_is_one_line_and_leaves_no_folder(tmp_path: Path) -> None:
-    (tmp_path / "bad.g2o").write_text("VERTEX_SE2 0 0 0\n")
-    said = refused("slam", "g2o", tmp_path / "bad.g2o", "--output", tmp_path / "out")
-    assert "line 1: expected 4 values after VERTEX_SE2, got 3" in said
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.skipif(not RECORDINGS.exists(), reason="the public pose graphs are not there (SAGA_FG_DATA)")
 @pytest.mark.parametrize(
     ("name", "cost"),

@@ -21,7 +21,7 @@ from pipelines.smoothing import for_given_tracks, load_smooth_config, smooth_sce
 from pipelines.tracking import track_scene
 from saga_fg import InputError, Scene, Tracks
 from tests.data_tools.kitti_example import write_sequence
-from tests.pipelines.command import saga_fg
+from tests.pipelines.command import done, refused
 
 OPTIONS = ("simulated", "--scenes", "2", "--seed", "3")
 
@@ -117,8 +117,7 @@ def test_the_command_refines_a_table_alone_beside_a_dataset_and_in_workers(tmp_p
         ("smooth", "file", "--tracks", tracks, "--output", tmp_path / "alone"),
         ("smooth", "file", "--tracks", tracks, "--output", tmp_path / "alone in workers", "--workers", "1"),
     ):
-        done = saga_fg(*words)
-        assert done.exit_code == 0, done.output
+        done(*words)
     rows = sum(len(path.read_text().splitlines()) - 1 for path in (tmp_path / "workers" / "labels").iterdir())
     assert rows == len((tmp_path / "beside" / "labels.csv").read_text().splitlines()) - 1
     assert len((tmp_path / "alone" / "labels.csv").read_text().splitlines()) > 100
@@ -141,9 +140,7 @@ def test_results_that_cannot_be_refined_are_one_line(
     ):
         options = [word for file in files for word in ("--tracks", file)]
         source = OPTIONS if empty in files else ("file",)
-        failed = saga_fg("smooth", *source, *options, "--output", tmp_path / "labels")
-        assert failed.exit_code == 2
-        assert expected in failed.output
+        assert expected in refused("smooth", *source, *options, "--output", tmp_path / "labels")
         assert not (tmp_path / "labels").exists()
 
 
@@ -166,10 +163,7 @@ def test_tracks_at_moments_without_a_detection_beside_a_table(tmp_path: Path) ->
     (tmp_path / "d.csv").write_text("\n".join(["timestamp,label,x,y", *rows]) + "\n")
     rows = [f"{k / 10},1,car,{k},0.2" for k in range(40)]
     (tmp_path / "t.csv").write_text("\n".join(["timestamp,id,label,x,y", *rows]) + "\n")
-    done = saga_fg(
-        "smooth", "file", tmp_path / "d.csv", "--tracks", tmp_path / "t.csv", "--output", tmp_path / "labels"
-    )
-    assert done.exit_code == 0, done.output
+    done("smooth", "file", tmp_path / "d.csv", "--tracks", tmp_path / "t.csv", "--output", tmp_path / "labels")
     assert len((tmp_path / "labels" / "labels.csv").read_text().splitlines()) == 41
 
 

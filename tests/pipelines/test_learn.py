@@ -8,12 +8,10 @@ from functools import partial
 import numpy as np
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 import pipelines.learning.interactions as learned_module
 from data_tools.datasets.detection_files import read_detections
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
-from pipelines.cli import app
 from pipelines.config import TrackConfig, load_config, load_interactions
 from pipelines.configuration import read_settings, write_settings
 from pipelines.learning import LearnedNoise, learn_noise, learned_fragment
@@ -40,7 +38,6 @@ from saga_fg.types.by_class import DEFAULT
 from tests.pipelines.command import done, refused
 from tests.saga_fg.following_pairs import RATE, following_pairs
 
-run = CliRunner().invoke
 FOLLOW = Following(CarFollowing(time_constant=float("inf")), rate=RATE, gap_scale=100.0)
 
 
@@ -181,12 +178,10 @@ def detections(tmp_path_factory):
 @pytest.fixture(scope="module")
 def learned(detections):
     output = detections.parent / "interactions.yaml"
-    arguments = ["learn", "interactions", "file", str(detections), "--output", str(output), "--passes", "1"]
+    arguments = ["learn", "interactions", "file", detections, "--output", output, "--passes", "1"]
     with pytest.MonkeyPatch.context() as patch:  # the way to the file is tested here, not how good the fit is
         patch.setattr(learned_module, "fit_interactions", partial(fit_interactions, iterations=1))
-        result = run(app, [*arguments, "--json", str(detections.parent / "figures.json")])
-    assert result.exit_code == 0, result.output
-    return output, result.output
+        return output, done(*arguments, "--json", detections.parent / "figures.json").output
 
 
 def test_edges_are_learned_from_unlabelled_detections(learned, detections):
@@ -205,8 +200,7 @@ def test_a_tracker_takes_them_over(learned, detections):
     config = load_config("file").with_interactions(load_interactions(path))
     assert config.tracker.edges == load_interactions(path).edges
     tracks = detections.parent / "tracks.csv"
-    arguments = ["track", "file", str(detections), "--interactions", str(path), "--output", str(tracks)]
-    assert run(app, arguments).exit_code == 0
+    done("track", "file", detections, "--interactions", path, "--output", tracks)
     assert len(tracks.read_text(encoding="utf-8").splitlines()) > 200
 
 

@@ -3,24 +3,18 @@
 import json
 
 import pytest
-from typer.testing import CliRunner
 
 pytest.importorskip("mcap_ros2")
 pytest.importorskip("rosbags")
 
 from data_tools.datasets.mcap.dataset import McapRecording
 from data_tools.datasets.mcap.source import TOPIC, McapSource, read_track_messages
-from pipelines.cli import app
 from pipelines.report.page import read_run_record
 from tests.data_tools import mcap_example as example
 from tests.data_tools.mcap_example import ARRAY, LIDAR, MOMENTS, START, STEP
+from tests.pipelines.command import done, refused
 
 LAST = MOMENTS - 1
-
-
-def saga_fg(*arguments):
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    return result.exit_code, result.output
 
 
 def messages_of(path):
@@ -37,8 +31,7 @@ def drive(tmp_path):
 
 
 def test_autoware_in_and_out(tmp_path, drive):
-    code, output = saga_fg("track", "mcap", drive, "--topic", f"lidar={LIDAR}", "--output", tmp_path / "tracks.mcap")
-    assert code == 0, output
+    done("track", "mcap", drive, "--topic", f"lidar={LIDAR}", "--output", tmp_path / "tracks.mcap")
     found = messages_of(tmp_path / "tracks.mcap")
     assert {(topic, kind) for topic, kind, *_ in found} == {(TOPIC, "autoware_perception_msgs/msg/TrackedObjects")}
     assert [time for _, _, time, _ in found] == [START + k * STEP for k in range(MOMENTS)]
@@ -59,8 +52,7 @@ def test_autoware_in_and_out(tmp_path, drive):
 def test_detection_arrays_in_and_out_under_their_own_names(tmp_path):
     path = example.write_bag(tmp_path / "bag", example.drive(example.detection_array, ARRAY, "/objects"))
     names = "CAR=car, PEDESTRIAN=pedestrian, SIGN="
-    code, output = saga_fg("track", "mcap", path, "--classes", names, "--output", tmp_path / "tracks.mcap")
-    assert code == 0, output
+    done("track", "mcap", path, "--classes", names, "--output", tmp_path / "tracks.mcap")
     *_, (topic, kind, _, last) = messages_of(tmp_path / "tracks.mcap")
     assert (topic, kind) == (TOPIC, ARRAY)
     assert {each.results[0].hypothesis.class_id for each in last.detections} == {"CAR", "PEDESTRIAN"}
@@ -69,34 +61,26 @@ def test_detection_arrays_in_and_out_under_their_own_names(tmp_path):
 
 def test_results_are_shown_and_judged(tmp_path, drive):
     tracks = tmp_path / "tracks.mcap"
-    assert saga_fg("track", "mcap", drive, "--output", tracks)[0] == 0
+    done("track", "mcap", drive, "--output", tracks)
     options = ("--recording", drive)
-    code, output = saga_fg("report", "mcap", tracks, *options, "--output", tmp_path / "report.html")
-    assert code == 0, output
-    code, output = saga_fg("view", "mcap", tracks, *options, "--save", tmp_path / "view.mcap")
-    assert code == 0, output
-    code, output = saga_fg("smooth", "mcap", drive, "--output", tmp_path / "labels")
-    assert code == 0, output
-    code, output = saga_fg("evaluate", "labels", "mcap", tmp_path / "labels", *options)
-    assert code == 2
-    assert "ground truth" in output
+    done("report", "mcap", tracks, *options, "--output", tmp_path / "report.html")
+    done("view", "mcap", tracks, *options, "--save", tmp_path / "view.mcap")
+    done("smooth", "mcap", drive, "--output", tmp_path / "labels")
+    assert "ground truth" in refused("evaluate", "labels", "mcap", tmp_path / "labels", *options)
 
 
 def test_tracks_in_another_frame_are_shown_in_it_or_refused(tmp_path, drive):
     for suffix in ("mcap", "csv"):
         tracks = tmp_path / f"tracks.{suffix}"
-        assert saga_fg("track", "mcap", drive, "--world", "base_link", "--output", tracks)[0] == 0
+        done("track", "mcap", drive, "--world", "base_link", "--output", tracks)
         page = ("report", "mcap", tracks, "--recording", drive, "--output", tmp_path / "report.html")
-        code, output = saga_fg(*page)  # the record beside the result tells its frame
-        assert code == 0, output
+        done(*page)  # the record beside the result tells its frame
         record = tmp_path / "tracks.run.json"
         if suffix == "mcap":
             record.unlink()
-            code, output = saga_fg(*page)
-            assert code != 0
-            text = " ".join(output.split())
-            assert "expected tracks in the frame map of the recording, got base_link; add --world base_link" in text
-            assert saga_fg(*page, "--world", "base_link")[0] == 0
+            said = refused(*page)
+            assert "expected tracks in the frame map of the recording, got base_link; add --world base_link" in said
+            done(*page, "--world", "base_link")
         else:
             assert McapSource(recording=[str(drive)]).with_kept(read_run_record(tracks).recordings).world == "base_link"
 
@@ -105,7 +89,7 @@ def test_tracks_are_read_back_as_they_were(tmp_path, drive):
     from data_tools.datasets.detection_files import read_tracks
 
     for suffix in ("mcap", "csv"):
-        assert saga_fg("track", "mcap", drive, "--output", tmp_path / f"tracks.{suffix}")[0] == 0
+        done("track", "mcap", drive, "--output", tmp_path / f"tracks.{suffix}")
     recording = McapRecording(drive)
     scene = recording.scene("drive")
     a, b = (
@@ -126,14 +110,12 @@ def test_tracks_are_read_back_as_they_were(tmp_path, drive):
 def test_several_recordings_in_parallel_and_again(tmp_path, drive):
     bag = example.write_bag(tmp_path / "bag", example.drive())
     command = ("track", "mcap", drive, bag, "--output", tmp_path / "run", "--workers", 2)
-    code, output = saga_fg(*command)
-    assert code == 0, output
+    done(*command)
     assert sorted(path.name for path in (tmp_path / "run" / "tracks").iterdir()) == ["bag.mcap", "drive.mcap"]
-    assert "0 done, 2 unchanged" in saga_fg(*command)[1]
-    assert "2 done, 0 unchanged" in saga_fg(*command, "--world", "base_link")[1]
-    code, output = saga_fg("track", "mcap", drive, bag, "--output", tmp_path / "tracks.mcap")
-    assert code != 0
-    assert "expected one recording; several need --workers" in output
+    assert "0 done, 2 unchanged" in done(*command).output
+    assert "2 done, 0 unchanged" in done(*command, "--world", "base_link").output
+    said = refused("track", "mcap", drive, bag, "--output", tmp_path / "tracks.mcap")
+    assert "expected one recording; several need --workers" in said
 
 
 def test_wrong_options(tmp_path, drive):
@@ -143,18 +125,14 @@ def test_wrong_options(tmp_path, drive):
         (("--topic", f"a={LIDAR}", "--topic", f"a={LIDAR}"), "the sensor a is given twice"),
         (("--classes", "car"), "--classes: expected NAME=VALUE with commas between them, got 'car'"),
     ]:
-        code, output = saga_fg("track", "mcap", drive, *options, "--output", tmp_path / "tracks.mcap")
-        assert code != 0
-        assert message in " ".join(output.split())
+        assert message in refused("track", "mcap", drive, *options, "--output", tmp_path / "tracks.mcap")
 
 
 def test_without_the_extra_it_is_named(tmp_path, drive, monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "rosbags", None)
-    code, output = saga_fg("track", "mcap", drive, "--output", tmp_path / "tracks.mcap")
-    assert code != 0
-    assert "pip install 'saga-fg[mcap]'" in " ".join(output.split())
+    assert "pip install 'saga-fg[mcap]'" in refused("track", "mcap", drive, "--output", tmp_path / "tracks.mcap")
 
 
 def truth_table(path, shift=0.0):
@@ -170,7 +148,7 @@ def truth_table(path, shift=0.0):
 
 def test_tracks_are_judged_by_a_table_a_file_or_a_topic(tmp_path, drive):
     tracks, figures = tmp_path / "tracks.mcap", tmp_path / "figures.json"
-    assert saga_fg("track", "mcap", drive, "--output", tracks)[0] == 0
+    done("track", "mcap", drive, "--output", tracks)
     table = truth_table(tmp_path / "truth.csv")
     found = {}
     for name, given in {
@@ -181,8 +159,7 @@ def test_tracks_are_judged_by_a_table_a_file_or_a_topic(tmp_path, drive):
         "tracked anew": ("--truth", table, "--recording", drive),
     }.items():
         result = () if name == "tracked anew" else (tracks,)
-        code, output = saga_fg("evaluate", "mcap", *result, *given, "--json", figures)
-        assert code == 0, output
+        done("evaluate", "mcap", *result, *given, "--json", figures)
         found[name] = json.loads(figures.read_text())["sweep"]["overall"]
     assert found["table"]["recall"] > 0.8
     assert found["table"]["fp"] == 0
@@ -194,18 +171,15 @@ def test_tracks_are_judged_by_a_table_a_file_or_a_topic(tmp_path, drive):
 
 def test_a_truth_that_is_not_there_is_named(tmp_path, drive):
     tracks = tmp_path / "tracks.mcap"
-    assert saga_fg("track", "mcap", drive, "--output", tracks)[0] == 0
-    code, output = saga_fg("evaluate", "mcap", tracks, "--truth", "/nowhere")
-    assert code == 2
-    assert f"expected a topic /nowhere with tracks, there are {TOPIC}" in " ".join(output.split())
-    code, output = saga_fg("evaluate", "mcap", tracks)
-    assert code == 2
-    assert "name it: --truth" in output
+    done("track", "mcap", drive, "--output", tracks)
+    said = refused("evaluate", "mcap", tracks, "--truth", "/nowhere")
+    assert f"expected a topic /nowhere with tracks, there are {TOPIC}" in said
+    assert "name it: --truth" in refused("evaluate", "mcap", tracks)
 
 
 def test_the_page_of_a_recording_shows_the_truth_of_a_table_and_the_recorded_path(tmp_path, drive):
     tracks = tmp_path / "tracks.mcap"
-    assert saga_fg("track", "mcap", drive, "--output", tracks)[0] == 0
+    done("track", "mcap", drive, "--output", tracks)
     source = McapSource(recording=[str(drive)], truth=str(truth_table(tmp_path / "truth.csv")))
     (result,) = source.read_results(tracks).scenes.values()
     recorded = McapRecording(drive).scene("drive")

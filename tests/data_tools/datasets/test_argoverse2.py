@@ -5,16 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from data_tools.datasets.argoverse2 import ArgoverseLogs
 from data_tools.datasets.argoverse2.logs import DetectedLogs
 from data_tools.datasets.argoverse2.source import SCORED, read_feather_tracks, write_feather_tracks, write_submission
-from pipelines.cli import app
 from saga_fg.errors import InputError
 from saga_fg.types.boxes import Boxes
 from saga_fg.types.track import Tracks
-from tests.pipelines.command import done
+from tests.pipelines.command import done, refused
 
 feather = pytest.importorskip("pyarrow.feather", reason="the extra [parquet] is not installed")
 pa = pytest.importorskip("pyarrow")
@@ -77,34 +75,24 @@ def test_boxes_come_into_the_city_frame(tmp_path):
     assert second.visible.tolist() == [True, False]
 
 
-def test_a_missing_column_a_missing_pose_and_a_broken_file_are_named(tmp_path):
-    annotations = boxes()
-    del annotations["category"]
-    with pytest.raises(InputError, match=r"annotations.feather: category: expected this column"):
-        write(tmp_path, annotations, poses()).scene("log")
-    ego = {name: column[1:] for name, column in poses().items()}
-    with pytest.raises(InputError, match=r"expected a pose at every time of boxes, 1100000000 has none"):
-        write(tmp_path, boxes(), ego).scene("log")
-    dataset = write(tmp_path, boxes() | {"length_m": ["long"] * 3}, poses())
-    with pytest.raises(InputError, match=r"annotations.feather: length_m: expected numbers, got object"):
-        dataset.scene("log")
-    dataset = write(tmp_path, boxes() | {"track_uuid": ["a", None, "b"]}, poses())
-    with pytest.raises(InputError, match=r"annotations.feather: track_uuid: expected a value in every row"):
-        dataset.scene("log")
-    dataset = write(tmp_path, boxes() | {"track_uuid": [["a"], ["a"], ["b"]]}, poses())
-    with pytest.raises(InputError, match=r"annotations.feather: track_uuid: row 1: expected text, got .*a"):
-        dataset.scene("log")
-    dataset = write(tmp_path, boxes(), poses() | {"tx_m": [100.0, np.inf, 100.0]})
-    with pytest.raises(InputError, match=r"city_SE3_egovehicle.feather: tx_m ty_m tz_m.*expected a finite number"):
-        dataset.scene("log")
-    dataset = write(tmp_path, boxes(), poses())
-    path = tmp_path / "log" / "annotations.feather"
-    path.write_bytes(path.read_bytes().replace(b"category", b"c\xf9tegory"))
-    with pytest.raises(InputError, match=r"annotations.feather: expected a readable Feather file: 'utf-8'"):
-        dataset.scene("log")
-    path.write_bytes(b"not feather")
-    with pytest.raises(InputError, match=r"expected a readable Feather file"):
-        dataset.scene("log")
+def test_what_is_wrong_in_a_log_is_named(tmp_path, subtests):
+    late = {name: column[1:] for name, column in poses().items()}
+    for annotations, ego, message in [
+        ({"category": None}, poses(), r"annotations.feather: category: expected this column"),
+        ({}, late, r"expected a pose at every time of boxes, 1100000000 has none"),
+        ({"length_m": ["long"] * 3}, poses(), r"annotations.feather: length_m: expected numbers, got object"),
+        ({"track_uuid": ["a", None, "b"]}, poses(), r"annotations.feather: track_uuid: expected a value in every row"),
+        ({"track_uuid": [["a"]] * 3}, poses(), r"annotations.feather: track_uuid: row 1: expected text, got .*a"),
+        ({}, poses() | {"tx_m": [100.0, np.inf, 100.0]}, r"egovehicle.feather: tx_m ty_m tz_m.*expected a finite numb"),
+    ]:
+        rows = {name: column for name, column in (boxes() | annotations).items() if column is not None}
+        with subtests.test(message), pytest.raises(InputError, match=message):
+            write(tmp_path, rows, ego).scene("log")
+    dataset, path = write(tmp_path, boxes(), poses()), tmp_path / "log" / "annotations.feather"
+    for content in (path.read_bytes().replace(b"category", b"c\xf9tegory"), b"not feather"):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"annotations.feather: expected a readable Feather file"):
+            dataset.scene("log")
 
 
 def test_a_root_without_logs_and_an_unknown_log_are_errors(tmp_path):
@@ -240,15 +228,10 @@ def test_the_command_from_detections_to_figures(tmp_path):
     feather.write_feather(pa.table(found), tmp_path / "found.feather")
     options = ["--dataroot", str(tmp_path), "--detections", str(tmp_path / "found.feather")]
 
-    def saga_fg(*arguments):
-        result = done(*arguments)
-        return result.output
-
     for name in ("tracks.feather", "tracks.csv", "tracks.pkl"):
-        saga_fg("track", "argoverse2", *options, "--output", tmp_path / name)
+        done("track", "argoverse2", *options, "--output", tmp_path / name)
     for name in ("tracks.feather", "tracks.csv"):
-        assert "car" in saga_fg("evaluate", "argoverse2", tmp_path / name, *options)
-    result = CliRunner().invoke(app, ["evaluate", "argoverse2", str(tmp_path / "tracks.pkl"), *options])
-    assert "a .pkl is not read" in " ".join(result.output.split())
-    saga_fg("track", "argoverse2", *options, "--output", tmp_path / "run", "--workers", 1)
+        assert "car" in done("evaluate", "argoverse2", tmp_path / name, *options).output
+    assert "a .pkl is not read" in refused("evaluate", "argoverse2", tmp_path / "tracks.pkl", *options)
+    done("track", "argoverse2", *options, "--output", tmp_path / "run", "--workers", 1)
     assert (tmp_path / "run" / "tracks.feather").read_bytes() == (tmp_path / "tracks.feather").read_bytes()

@@ -256,34 +256,30 @@ def test_covariances_are_not_required_but_checked(tmp_path):
         read_tracking_results(path)
 
 
+def written_and_read(folder: Path, *scenes: tuple[Scene, list[Tracks]]) -> dict[str, Any]:
+    write_tracking_results(folder / "out.json", scenes, META)
+    return dict(read_tracking_results(folder / "out.json").samples)
+
+
 def test_ids_of_two_scenes_differ_and_classes_of_the_format_stay(tmp_path):
-    path = tmp_path / "out.json"
-    write_tracking_results(path, [(scene("x", ["a"]), [tracks()]), (scene("y", ["b"]), [tracks()])], META)
-    samples = read_tracking_results(path).samples
-    assert samples["a"].id.tolist() == ["x-7"]
-    assert samples["b"].id.tolist() == ["y-7"]
-    path = tmp_path / "out.json"
-    write_tracking_results(path, [(scene(), [tracks(), tracks(labels=["bus"])])], META)
-    samples = read_tracking_results(path).samples
+    samples = written_and_read(tmp_path, (scene("x", ["a"]), [tracks()]), (scene("y", ["b"]), [tracks()]))
+    assert (samples["a"].id.tolist(), samples["b"].id.tolist()) == (["x-7"], ["y-7"])
+    samples = written_and_read(tmp_path, (scene(), [tracks(), tracks(labels=["bus"])]))
     assert (samples["a"].id.tolist(), samples["b"].id.tolist()) == (["scene-1-7"], ["scene-1-7-bus"])
 
 
 def test_only_tracking_classes_are_written_and_unknown_velocities_are_zero(tmp_path):
-    path = tmp_path / "out.json"
-    write_tracking_results(path, [(scene(tokens=["a"]), [tracks(velocity=(np.nan, np.nan))])], META)
-    assert read_tracking_results(path).samples["a"].boxes.velocity.tolist() == [[0, 0]]
-    path = tmp_path / "out.json"
+    one = scene(tokens=["a"])
+    assert written_and_read(tmp_path, (one, [tracks(velocity=(np.nan, np.nan))]))["a"].boxes.velocity.tolist() == [
+        [0, 0]
+    ]
     mixed = tracks((1, 2, 3), ("barrier", "bus", "traffic_cone"), (1, 1, 1))
-    write_tracking_results(path, [(scene(tokens=["a"]), [mixed])], META)
-    assert read_tracking_results(path).samples["a"].boxes.label.tolist() == ["bus"]
+    assert written_and_read(tmp_path, (one, [mixed]))["a"].boxes.label.tolist() == ["bus"]
 
 
 def test_the_best_500_boxes_are_kept(tmp_path):
-    path = tmp_path / "out.json"
     score = np.random.default_rng(0).permutation(600) / 600
-    many = tracks(range(600), ["car"] * 600, score)
-    write_tracking_results(path, [(scene(tokens=["a"]), [many])], META)
-    kept = read_tracking_results(path).samples["a"]
+    kept = written_and_read(tmp_path, (scene(tokens=["a"]), [tracks(range(600), ["car"] * 600, score)]))["a"]
     assert len(kept) == 500
     assert kept.score.min() == 100 / 600
 
