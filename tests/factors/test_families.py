@@ -19,6 +19,7 @@ from factors import (
     plane_factor,
     prior_factors,
     relative_factors,
+    residual_factor,
     solve,
 )
 from factors.manifolds import cross_matrix, inverse_right_jacobian, rotation_exp, rotation_log
@@ -161,6 +162,9 @@ def test_polar_measurements_of_a_known_scene_and_across_the_cut():
     values = values_of([1], [np.array([-10.0, -0.01])])
     error = detection_factors([1], RangeBearing(2), [[10.0, np.pi - 0.001]], np.eye(2)).error(values)
     assert error == pytest.approx(0.5 * 0.002**2, rel=1e-2)
+    numerical = residual_factor([1], [2], RangeBearing(2).predict, np.eye(2), angles=(1,))
+    J = numerical.linearise(values_of([1], [np.array([-10.0, 0.0])])).at(0).jacobian()[0]
+    np.testing.assert_allclose(J, [[-1.0, 0.0], [0.0, -0.1]], atol=1e-8)
 
 
 def test_range_and_bearing_are_gtsams_own_factor():

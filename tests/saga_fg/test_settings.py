@@ -72,6 +72,7 @@ def test_numbers_out_of_range_are_refused(subtests):
         (Following, {"lateral_scale": 0.0}, "lateral_scale: expected a number > 0"),
         (NoiseModel, {"position": 0.0}, "position: expected a finite number > 0, got 0.0"),
         (NoiseModel, {"velocity": math.inf}, "velocity: expected a finite number > 0, got inf"),
+        (NoiseModel, {"yaw": 0.0}, "yaw: expected a finite number > 0, got 0.0"),
         (NoiseModel, {"range_noise": -0.1}, "range_noise: expected a finite number >= 0"),
         (FieldOfView, {"max_range": -1.0}, "max_range: expected a number > 0"),
         (FieldOfView, {"min_azimuth": 2.0, "max_azimuth": 1.0}, "max_azimuth: expected at least min_azimuth 2, got 1"),

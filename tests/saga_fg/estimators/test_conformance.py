@@ -280,41 +280,6 @@ def test_the_suite_would_notice():
 # Every estimator is indifferent to order, to coupling where there is none, and to a snapshot between
 
 
-def permuted(operation, rng):
-    """Return the operation with its nodes in another order."""
-    if isinstance(operation, Add):
-        order = rng.permutation(len(operation.nodes))
-        return Add(operation.nodes[order], operation.means[order], operation.covariances[order])
-    if isinstance(operation, Marginalise):
-        return Marginalise(rng.permutation(operation.nodes))
-    if isinstance(operation, Update):
-        m = operation.measurements
-        order = rng.permutation(len(m))
-        return Update(Measurements(m.nodes[order], m.z[order], m.H[order], m.R[order]))
-    graph = operation.transition.graph
-    order = rng.permutation(len(graph))
-    place = np.argsort(order)
-    groups = tuple(
-        Edges(g.interaction, place[g.target], place[g.source], g.rate, g.A_self, g.A_other, g.b) for g in graph.edges
-    )
-    types = tuple(graph.types[k] for k in order)
-    return Predict(discretise(SceneGraph(graph.nodes[order], types, groups), operation.transition.dt))
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_the_order_in_which_nodes_are_told_does_not_matter(make, seed):
-    rng = np.random.default_rng(seed)
-    program = random_program(rng, moments=6)
-    one, likelihoods = run(program, make())
-    other, same_likelihoods = run([permuted(operation, rng) for operation in program], make())
-    nodes = one.nodes
-    assert sorted(other.nodes.tolist()) == sorted(nodes.tolist())
-    assert same_likelihoods == pytest.approx(likelihoods, rel=1e-9, nan_ok=True)
-    P = one.joint_covariance(nodes)
-    assert np.linalg.norm(other.joint_covariance(nodes) - P) <= 1e-9 * np.linalg.norm(P)
-    assert np.abs(other.joint_mean(nodes) - one.joint_mean(nodes)).max() <= 1e-9 * np.sqrt(np.diag(P)).max()
-
-
 @pytest.mark.parametrize("seed", range(2))
 def test_rate_zero_is_independent_filters_exactly(make, seed):
     """Together or each alone: the same digits, and no correlation between any two.

@@ -64,8 +64,8 @@ def adds(*factors):
     return Additions(factors=list(factors))
 
 
-def single(key, residual, dim=4, jacobians=None):
-    return residual_factor((key,), (Vector(dim),), residual, np.eye(1), jacobians, name="wall")
+def single(key, residual, dim=4):
+    return residual_factor((key,), (Vector(dim),), residual, np.eye(1), name="wall")
 
 
 def custom(key, function, dim=1):
@@ -113,7 +113,6 @@ CASES = {
         lambda v, k: Additions([NewVariable(OBJECT, 3, np.eye(2))]),
         "expected a vector, a pose, a plane or a bias",
     ),
-    "text as state": (lambda v, k: Additions([NewVariable(OBJECT, 3, "x")]), "object 3: expected a vector.*got str"),
     "negative id": (lambda v, k: Additions([NewVariable(OBJECT, -3, np.zeros(4))]), "expected id to be a whole number"),
     "unknown variable": (
         lambda v, k: adds(prior_factor(key_of(OBJECT, 99, 34), np.zeros(4), np.eye(4))),
@@ -123,7 +122,6 @@ CASES = {
         lambda v, k: adds(single(key_of(OBJECT, 12, 2), lambda x: x[:1])),
         "wall: expected variables of the graph, object 12 of epoch 2 is none: never added, or marginalised",
     ),
-    "key of nobody": (lambda v, k: adds(prior_factor(5, np.zeros(4), np.eye(4))), "variable 5 is none"),
     "linear, too wide": (
         lambda v, k: adds(prior_factor(k, np.zeros(5), np.eye(5))),
         "user: linear factor on car 12 at 3.40 s: expected 4 columns, as the variables have dimensions, got 5",
@@ -139,10 +137,6 @@ CASES = {
     "native, too long": (
         lambda v, k: adds(gtsam.PriorFactorVector(k, np.zeros(5), UNIT(5, 1.0))),
         r"PriorFactorVector on car 12 at 3.40 s: expected variables Vector\(dim=5\)",
-    ),
-    "native, too short": (
-        lambda v, k: adds(gtsam.BetweenFactorVector(k, v.key(OBJECT, 7), np.zeros(3), UNIT(3, 1.0))),
-        r"BetweenFactorVector on car 12 at 3.40 s, car 7 at 3.40 s: expected variables Vector\(dim=3\)",
     ),
     "native, other noise": (
         lambda v, k: adds(gtsam.BearingRangeFactor2D(k, v.key(OBJECT, 7), gtsam.Rot2(), 1.0, UNIT(1, 1.0))),
@@ -171,24 +165,8 @@ CASES = {
     "custom, no residual": (lambda v, k: adds(custom(k, lambda this, values, H: None)), "custom factor on car 12"),
     "custom, raises": (lambda v, k: adds(custom(k, raising)), r"custom factor on car 12 at 3.40 s: KeyError\('oops'\)"),
     "custom, NaN": (lambda v, k: adds(custom(k, lambda this, values, H: np.full(1, np.nan))), "custom factor.*finite"),
-    "custom, no noise": (
-        lambda v, k: adds(gtsam.CustomFactor(None, [k], raising)),
-        "CustomFactor: expected noise with variances",
-    ),
     "ours, raises": (lambda v, k: adds(single(k, raising)), "user: wall on car 12 at 3.40 s: .*oops"),
     "ours, NaN": (lambda v, k: adds(single(k, lambda x: [np.inf])), "wall on car 12 at 3.40 s: .*finite number"),
-    "ours, wrong residual": (
-        lambda v, k: adds(single(k, lambda x: x)),
-        r"user: wall on car 12 at 3.40 s: residual: expected shape \(1\), got",
-    ),
-    "ours, wrong Jacobian": (
-        lambda v, k: adds(single(k, lambda x: x[:1], jacobians=lambda x: [np.eye(3)])),
-        r"Jacobian 0: expected shape \(1, 4\), got \(3, 3\)",
-    ),
-    "ours, no Jacobian": (
-        lambda v, k: adds(single(k, lambda x: x[:1], jacobians=lambda x: None)),
-        "wall on car 12 at 3.40 s",
-    ),
     "ours, other dimension": (
         lambda v, k: adds(single(k, lambda x: x[:1], dim=6)),
         r"wall on car 12 at 3.40 s: expected variables Vector\(dim=6\), got Vector\(dim=4\)",
@@ -196,10 +174,6 @@ CASES = {
     "stacked, other dimension": (
         lambda v, k: adds(ResidualFactors([[k]], (2,), lambda x: x, np.eye(2), name="walls")),
         r"walls on car 12 at 3.40 s: expected variables Vector\(dim=2\)",
-    ),
-    "stacked, raises": (
-        lambda v, k: adds(ResidualFactors([[k]], (4,), raising, np.eye(2), name="walls")),
-        "user: walls on car 12 at 3.40 s: .*oops",
     ),
 }
 

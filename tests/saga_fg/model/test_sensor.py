@@ -176,15 +176,11 @@ def test_wrong_edges_are_named(subtests):
     for columns, message in [
         ({"target": (0, 1)}, "edges of pull: source: expected 2 entries, got 1"),
         ({"target": 0}, "edges of pull: target: expected a list of integers, got 0"),
-        ({"target": [0.5]}, r"edges of pull: target: expected a list of integers, got \[0.5\]"),
-        ({"source": ["b"]}, "edges of pull: source: expected a list of integers"),
         ({"source": (0,)}, "edges of pull: node row 0 has an edge to itself"),
         ({"rate": [-0.5]}, r"edges of pull: rate\[0\]: expected a rate >= 0 in 1/s, got -0.5"),
-        ({"rate": [np.nan]}, r"edges of pull: rate\[0\]: expected a finite number"),
         ({"rate": [1.0, 1.0]}, r"edges of pull: rate: expected shape \(1,\)"),
         ({"A_self": np.zeros((1, 4, 3))}, r"edges of pull: A_self: expected shape \(1, 4, 4\), got \(1, 4, 3\)"),
         ({"A_other": np.full((1, 4, 4), np.inf)}, r"edges of pull: A_other\[0, 0, 0\]: expected a finite number"),
-        ({"A_other": np.zeros((4, 4))}, "edges of pull: A_self: expected shape"),
         ({"b": np.zeros((1, 3))}, r"edges of pull: b: expected shape \(1, 4\)"),
     ]:
         with subtests.test(message), pytest.raises(InputError, match=message):
@@ -195,7 +191,6 @@ def test_wrong_graphs_are_refused(subtests):
     for nodes, types, groups, message in [
         ([1, 1], (CAR, CAR), (), "nodes: expected unique ids, 1 occurs more than once"),
         ([1, 2], (CAR,), (), "types: expected 2 node types, got 1"),
-        ([1.5], (CAR,), (), "nodes: expected a list of integers"),
         ([1, 2], (CAR, CAR), (edges((0,), (2,)),), "edges of pull: source: row 2 is outside 2 nodes"),
         ([1, 2], (CAR, CAR), (edges((-1, 0), (1, 1)),), "edges of pull: target: row -1 is outside 2 nodes"),
         ([8, 9], (CAR, TRUCK), (edges((0,), (1,)),), "source: node 9 has 6 components, the interaction 4"),

@@ -187,10 +187,7 @@ def test_a_loop_moves_submaps_as_a_whole():
 def test_a_loop_that_is_none_names_its_ends(subtests):
     for motion, covariance, message in [
         (np.eye(3), Q, r"first_T_second: expected shape \(4, 4\), got \(3, 3\)"),
-        (2 * np.eye(4), Q, "first_T_second: expected a rigid 4 x 4 transform"),
-        (np.eye(4), np.full((6, 6), np.nan), "covariance"),
         (np.eye(4), Q[:3, :3], r"covariance: expected shape \(6, 6\), got \(3, 3\)"),
-        (np.eye(4), np.zeros((6, 6)), "covariance: expected a symmetric matrix, positive definite"),
         (np.eye(4), Q + np.triu(np.full((6, 6), 1e-9), 1), "covariance: expected a symmetric matrix"),
     ]:
         with subtests.test(message), pytest.raises(InputError, match=f"loop from 2 to 5: {message}"):

@@ -69,7 +69,7 @@ def written(timestamp, places, corruption):
 
 
 @pytest.mark.parametrize("estimator", [*ESTIMATORS, "centerpoint"])
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     corruptions=st.lists(st.one_of(st.none(), corrupted()), max_size=14),
     epoch=st.sampled_from([0.0, 1.7e9]),

@@ -73,11 +73,8 @@ def test_wrong_columns_are_named(subtests):
     for columns, message in [
         ({"label": ["car", 1.0]}, None),
         ({"label": ["car", ""]}, r"label\[1\]: expected a name"),
-        ({"label": [1, 2]}, "label: expected a list of strings"),
         ({"position": [(0, 0, 0)]}, r"position: expected shape \(2, 3\), got \(1, 3\)"),
-        ({"position": [(0, 0), (0, 0)]}, r"position: expected shape \(2, 3\), got \(2, 2\)"),
         ({"position": [(0, 0, 0), (0, NAN, 0)]}, r"position\[1, 1\]: expected a finite number, got nan"),
-        ({"position": [(0, 0, 0), (0, 0, np.inf)]}, r"position\[1, 2\]: expected a finite number, got inf"),
         (
             {"size": [(1, 1, 1), (4, -2, 1)]},
             r"size\[1\]: expected positive length, width, height in m, got \[4.0, -2.0",
@@ -87,7 +84,6 @@ def test_wrong_columns_are_named(subtests):
         ({"yaw": [0.0]}, r"yaw: expected shape \(2,\), got \(1,\)"),
         ({"yaw": [0.0, np.inf]}, r"yaw\[1\]: expected a finite number, or NaN for unknown, got inf"),
         ({"velocity": [(0, 0), (0, np.inf)]}, r"velocity\[1, 1\]: expected a finite number, or NaN"),
-        ({"velocity": [(0, 0, 0), (0, 0, 0)]}, r"velocity: expected shape \(2, 2\), got \(2, 3\)"),
     ]:
         with subtests.test(message):
             good = {"label": ["car", "car"], "position": [(0, 0, 0), (1, 0, 0)]}
@@ -214,6 +210,7 @@ def test_known_volumes_overlap_and_unknown_ones_nothing():
     assert iou_3d(box(), box(z=1.5)) == pytest.approx(0.0)
     assert iou_3d(box(), box(z=2.0)) == 0.0
     assert iou_3d(box(), box(height=0.5)) == pytest.approx(1 / 3)
+    assert np.isnan(paired_bev_iou(box(), box(yaw=NAN))).all()
     unknown = Boxes.of(["car"], [(0, 0, 0)])
     for function in (bev_iou, iou_3d):
         assert function(unknown, box()).tolist() == [[0.0]]

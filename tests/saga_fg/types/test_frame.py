@@ -68,15 +68,10 @@ def test_an_empty_table_and_one_that_moves():
 def test_a_wrong_detection_is_refused(subtests):
     for arguments, message in [
         ({"label": ""}, r"label\[0\]: expected a name"),
-        ({"label": 3}, "label: expected a list of strings"),
-        ({"position": (0, 0)}, r"position: expected shape \(1, 3\), got \(1, 2\)"),
         ({"position": (0, 0, NAN)}, r"position\[0, 2\]: expected a finite number, got nan"),
-        ({"position": "here"}, "position: expected numbers"),
         ({"size": (4, 2, -1)}, r"size\[0\]: expected positive length, width, height"),
-        ({"yaw": np.inf}, r"yaw\[0\]: expected a finite number, or NaN"),
         ({"velocity": (np.inf, 0)}, r"velocity\[0, 0\]: expected a finite number, or NaN"),
         ({"score": NAN}, r"score\[0\]: expected a finite number, got nan"),
-        ({"score": "high"}, "score: expected numbers"),
         ({"score": None}, r"score"),
     ]:
         with subtests.test(message), pytest.raises(InputError, match=message):
@@ -94,7 +89,6 @@ def test_a_wrong_frame_is_refused(subtests):
         ({"timestamp": "0.1"}, "timestamp: expected a finite number of seconds, got '0.1'"),
         ({"timestamp": np.inf}, "timestamp: expected a finite number of seconds, got inf"),
         ({"timestamp": 1.7e18}, "timestamp: expected seconds, got 1.7e\\+18: milli-, micro- or nanoseconds?"),
-        ({"timestamp": "noon"}, "timestamp: expected a finite number of seconds, got 'noon'"),
         ({"timestamp": None}, "timestamp: expected a finite number of seconds, got None"),
         ({"sensor": ""}, "sensor: expected a name, got ''"),
         ({"sensor": 7}, "sensor: expected a name, got 7"),
@@ -102,7 +96,6 @@ def test_a_wrong_frame_is_refused(subtests):
         ({"coordinates": "ego"}, "world_T_ego: expected a pose, since the detections are in ego coordinates"),
         ({"coordinates": "sensor"}, "world_T_ego: expected a pose, since the detections are in sensor coordinates"),
         ({"world_T_ego": np.zeros((4, 4))}, "world_T_ego: expected a rigid 4 x 4 transform"),
-        ({"world_T_ego": np.eye(3)}, r"world_T_ego: expected shape \(4, 4\)"),
         ({"detections": [Detection("car", (0, 0, 0))]}, "detections: expected Detections, got list"),
     ]:
         with subtests.test(message), pytest.raises(InputError, match=message):
@@ -172,7 +165,6 @@ def test_wrong_columns_are_named(subtests):
     for columns, message in [
         ({"id": [1, 1]}, "id: expected unique ids, 1 occurs more than once"),
         ({"id": [1]}, "id: expected 2 entries, got 1"),
-        ({"id": [0.5, 1.5]}, "id: expected a list of integers"),
         ({"score": [0.5, np.nan]}, r"score\[1\]: expected a finite number"),
         ({"score": [0.5]}, r"score: expected shape \(2,\)"),
         ({"position_covariance": np.ones((2, 3, 3))}, r"position_covariance: expected shape \(2, 2, 2\)"),
@@ -224,7 +216,6 @@ def test_a_wrong_scene_is_refused(subtests):
         ({"timestamps": [0.0, 0.5, 0.5]}, r"scene crossing: timestamps\[2\]: expected increasing times, time repeats"),
         ({"timestamps": [0.0, 1.0, 0.5]}, r"scene crossing: timestamps\[2\]: .* time runs backwards at 0.500000 s"),
         ({"timestamps": [0.0, np.nan, 1.0]}, r"timestamps\[1\]: expected a finite number, got nan"),
-        ({"timestamps": [[0.0, 0.5, 1.0]]}, r"timestamps: expected shape \(any,\)"),
         ({"world_T_ego": np.tile(np.eye(4), (2, 1, 1))}, r"world_T_ego: expected shape \(3, 4, 4\)"),
         ({"world_T_ego": np.tile(2 * np.eye(4), (3, 1, 1))}, r"scene crossing: world_T_ego\[0\]: expected a rigid"),
         ({"tokens": ("",)}, "scene crossing: tokens: expected 3 entries, got 1"),
