@@ -3,6 +3,7 @@
 import os
 import signal
 from contextlib import chdir, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from shlex import quote
 from typing import Annotated
@@ -11,7 +12,7 @@ import typer
 
 from data_tools.files import check_writable, write_text
 from pipelines.cli.console import counted, working
-from pipelines.cli.options import Verbose
+from pipelines.cli.options import Verbose, as_command
 from pipelines.review import (
     CORRECTIONS,
     ReviewServer,
@@ -23,16 +24,10 @@ from pipelines.review import (
 from saga_fg.errors import InputError
 
 
-def review(
-    folder: Annotated[Path, typer.Argument(help="Folder that saga-fg smooth wrote.")],
-    corrections: Annotated[
-        Path | None,
-        typer.Option(
-            "--corrections",
-            help="File of corrections to go on with.  [default: that of the labels, else corrections.jsonl in FOLDER]",
-            metavar="FILE",
-        ),
-    ] = None,
+@dataclass(frozen=True)
+class InsteadOptions:
+    """What is made of the labels, or read from a labelling tool, in place of a page that is served."""
+
     page: Annotated[
         Path | None,
         typer.Option(
@@ -41,7 +36,7 @@ def review(
             "saved, and solves nothing again.",
             metavar="FILE",
         ),
-    ] = None,
+    ] = None
     out: Annotated[
         tuple[str, Path] | None,
         typer.Option(
@@ -49,13 +44,26 @@ def review(
             help="Write the labels for a labelling tool instead: openlabel, cvat or sustechpoints, and a folder.",
             metavar="TOOL DIR",
         ),
-    ] = None,
+    ] = None
     back: Annotated[
         tuple[str, Path] | None,
         typer.Option(
             "--import",
             help="Add what was changed in a labelling tool to the corrections instead: its name, and the folder.",
             metavar="TOOL DIR",
+        ),
+    ] = None
+
+
+def _review(
+    folder: Annotated[Path, typer.Argument(help="Folder that saga-fg smooth wrote.")],
+    instead: InsteadOptions,
+    corrections: Annotated[
+        Path | None,
+        typer.Option(
+            "--corrections",
+            help="File of corrections to go on with.  [default: that of the labels, else corrections.jsonl in FOLDER]",
+            metavar="FILE",
         ),
     ] = None,
     who: Annotated[str | None, typer.Option("--who", help="Your name in corrections.  [default: as logged in]")] = None,
@@ -79,6 +87,7 @@ def review(
       saga-fg review labels --export cvat boxes   # then, with what was changed there
       saga-fg review labels --import cvat boxes
     """
+    page, out, back = instead.page, instead.out, instead.back
     if page is not None and page.suffix not in (".html", ".htm"):
         raise InputError(f"{page}: expected a file name that ends in .html")
     if sum(one is not None for one in (page, out, back)) > 1:
@@ -113,3 +122,6 @@ def review(
             typer.echo(f"{server.url}\nCorrections go to {file}; Ctrl-C ends.")
             server.serve_forever()
         typer.echo(f"labels with the corrections: saga-fg smooth ... --corrections {quote(str(file))}", err=True)
+
+
+review = as_command(_review)

@@ -145,6 +145,34 @@ def _serve_stream(
 serve = how.as_command(_serve_stream)
 
 
+@dataclass(frozen=True)
+class NodeOptions:
+    """Names of a node's messages, and what carries these."""
+
+    classes: Annotated[
+        str | None,
+        typer.Option(
+            "--classes", help="Names of classes: CAR=car. `SIGN=` leaves a class out.", metavar="THEIRS=OURS,..."
+        ),
+    ] = None
+    world: Annotated[str, typer.Option("--world", help="Frame to track in.", metavar="FRAME")] = WORLD
+    ego: Annotated[str, typer.Option("--ego", help="Frame of the vehicle.", metavar="FRAME")] = DEFAULT_EGO
+    odometry: Annotated[
+        str | None,
+        typer.Option(
+            "--odometry", help="Topic of nav_msgs/Odometry for the pose, beside /tf and /tf_static.", metavar="TOPIC"
+        ),
+    ] = None
+    middleware: Annotated[
+        Literal["rclpy", "cyclonedds"] | None,
+        typer.Option(
+            "--middleware",
+            help="rclpy: a node of the ROS 2 that is installed; cyclonedds: DDS without ROS.  [default: rclpy if it is "
+            "installed]",
+        ),
+    ] = None
+
+
 def _serve_ros2(
     detections: Annotated[
         list[str],
@@ -166,28 +194,7 @@ def _serve_ros2(
     ],
     service: ServiceOptions,
     tracker: how.TrackerOptions,
-    classes: Annotated[
-        str | None,
-        typer.Option(
-            "--classes", help="Names of classes: CAR=car. `SIGN=` leaves a class out.", metavar="THEIRS=OURS,..."
-        ),
-    ] = None,
-    world: Annotated[str, typer.Option("--world", help="Frame to track in.", metavar="FRAME")] = WORLD,
-    ego: Annotated[str, typer.Option("--ego", help="Frame of the vehicle.", metavar="FRAME")] = DEFAULT_EGO,
-    odometry: Annotated[
-        str | None,
-        typer.Option(
-            "--odometry", help="Topic of nav_msgs/Odometry for the pose, beside /tf and /tf_static.", metavar="TOPIC"
-        ),
-    ] = None,
-    middleware: Annotated[
-        Literal["rclpy", "cyclonedds"] | None,
-        typer.Option(
-            "--middleware",
-            help="rclpy: a node of the ROS 2 that is installed; cyclonedds: DDS without ROS.  [default: rclpy if it is "
-            "installed]",
-        ),
-    ] = None,
+    node: NodeOptions,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -208,13 +215,13 @@ def _serve_ros2(
     from pipelines.serving.ros2 import Ros2Node, result_topics, shown_tracks
 
     topics = sensor_topics("--detections", detections)
-    options = RecordingOptions(topics, pairs("--classes", classes), world, ego, odometry)
+    options = RecordingOptions(topics, pairs("--classes", node.classes), node.world, node.ego, node.odometry)
     results = result_topics(tracks)
 
     def run(stream: StreamTracker[Any], ready: Ready, stop: StopRequest) -> None:
-        node = Ros2Node(stream, options, results, middleware)
-        ready(node.about)
-        node.run(stop)
+        served = Ros2Node(stream, options, results, node.middleware)
+        ready(served.about)
+        served.run(stop)
 
     def option_for(mend: Mend) -> str:
         return option_text({"classes": mend.classes})

@@ -1,10 +1,11 @@
 """`saga-fg slam`: trajectories, maps and landmarks from recorded scans, and pose graphs from files."""
 
+import itertools
 import os
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import typer
@@ -98,7 +99,7 @@ class SourceOptions:
 
 @dataclass(frozen=True)
 class DriveOptions:
-    """Landmarks and objects as nodes of the graph."""
+    """Landmarks and objects as nodes of the graph, and whether one looks on."""
 
     landmarks: Annotated[
         bool, typer.Option("--landmarks/--no-landmarks", help="Walls and poles as nodes of the graph.")
@@ -113,6 +114,7 @@ class DriveOptions:
             help="Folder of a detector: Car/, Pedestrian/, Cyclist/; SOURCE/detections/pointrcnn if not given.",
         ),
     ] = None
+    view: Annotated[bool, typer.Option("--view", help="Show path and map in rerun's viewer (extra [view]).")] = False
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,6 @@ def scans(
     drive: DriveOptions,
     logged: LoggedOptions,
     earlier: MapOptions,
-    live: Annotated[bool, typer.Option("--view", help="Show path and map in rerun's viewer (extra [view]).")] = False,
     config: Config = None,
     verbose: Verbose = False,
 ) -> None:
@@ -189,9 +190,9 @@ def scans(
       saga-fg slam scans data/kitti --sequence 0000 --objects --output slam
       saga-fg slam scans data/kitti_odometry --sequence 07 --output slam
     """
-    if live and earlier.known_map is not None:
+    if drive.view and earlier.known_map is not None:
         raise InputError("--view: expected without --map")
-    if live:
+    if drive.view:
         from pipelines.view import load_rerun
 
         load_rerun()
@@ -239,13 +240,18 @@ def scans(
     if slam_map is not None:
         _localise(recording, slam_map, earlier.guess, slam.localisation, output, log)
         return
-    watch = _opened_viewer(output.name) if live else None
+    shown, number = _opened_viewer(output.name) if drive.view else None, itertools.count(1)
     with progress_bar(unit="scans") as progress:
+
+        def watch(*placed: Any) -> None:
+            if shown is not None:
+                shown(*placed)
+            progress("slam", next(number), len(recording))
+
         lidar = replace(slam.lidar, landmarks=slam.lidar.landmarks and drive.landmarks)
         result = lidar_slam(
             recording,
             settings=lidar,
-            progress=progress,
             providers=slam.new_providers(),
             detectors=slam.new_detectors(),
             log=log,

@@ -25,7 +25,6 @@ from pipelines.slam.driver import FrontEnd, MovingObjects, Slam, SlamResult, Sla
 from pipelines.slam.loop_closures import LoopSearch, LoopSettings, PlaceLoops
 from pipelines.slam.odometry import LidarOdometry, Odometry, OdometrySettings
 from pipelines.slam.vehicle_sensors import Vehicle, start_by_fixes
-from pipelines.tracking import Progress
 from saga_fg import InputError, Tracker
 from saga_fg.graph import FactorProvider
 from saga_fg.model import LandmarkDetector, PlaneLandmark, PoleLandmark
@@ -127,7 +126,6 @@ def lidar_slam(
     scans: ScanSequence,
     *,
     settings: LidarSlamSettings | None = None,
-    progress: Progress | None = None,
     providers: Sequence[FactorProvider] = (),
     detectors: Sequence[LandmarkDetector] = (),
     odometry: Odometry | None = None,
@@ -170,8 +168,6 @@ def lidar_slam(
             step = slam.step(scan, time, imu=ego.imu, gps=ego.gps, detections=detections, wheels=ego.wheels)
         if watch is not None:
             watch(slam, scan, time - float(scans.timestamps[0]), step)
-        if progress is not None:
-            progress("slam", k + 1, len(scans))
     return slam.finish()
 
 

@@ -77,7 +77,7 @@ def test_config_begins_with_five_settings_and_leads_to_all(tmp_path):
                 value = value[next(iter(value)) if part == "*" else part]
         assert "saga-fg config --full" in printed.splitlines()[0]
         everything = saga_fg("config", "--full", *option).stdout
-        assert len(printed) < 0.6 * len(everything)
+        assert len(printed) < 0.7 * len(everything)
         path = tmp_path / "first.yaml"
         path.write_text(printed)
         assert saga_fg("config", "--full", *option, "--config", path).stdout == everything
