@@ -9,6 +9,8 @@ where they come within `WIDTH` m of each other. There, vehicle i is to wait for 
     all_way_stop   four arms, all ranks are equal, everybody halts at the line
     priority_road  four arms, of which two have priority; those who turn left wait for those who go straight on
     cone_merge     cones close the right of two lanes; zip merging: who comes to the line first goes first
+    zebra          people cross a road of two lanes, and have priority
+    midblock       they have not, and wait for a gap
 
 Nobody enters where another one is already on the way through. A share `TAKERS` of the drivers do not wait for their
 turn. Who goes in takes the right of way of j that has the better rank, or came first, could go, and comes to where
@@ -42,7 +44,7 @@ from saga_fg.numerics import BoolArray, FloatArray, IntArray, yaw_transform
 from saga_fg.tracking.right_of_way import free_time
 from saga_fg.types import Boxes, Scene
 
-Rule = Literal["all_way_stop", "priority_road", "cone_merge"]
+Rule = Literal["all_way_stop", "priority_road", "cone_merge", "zebra", "midblock"]
 UNSEEN = 1000  # first seed of scenes that no weight is fitted to, and no setting chosen on
 STEP = 0.05  # s
 KINDS = TrafficSettings(truck_share=0.08, bus_share=0.02)
@@ -53,7 +55,13 @@ MERGE, TAPER = 90.0, 35.0  # m along a lane to the end of the taper, and its len
 WIDTH = 2.4  # m between the middles of vehicles that would touch
 JOINED = 5.0  # m after which those who have come together are one behind the other
 ROOM = 14.0  # m behind the middle of the last vehicle, for another one
-INTERVALS = {"all_way_stop": 7.0, "priority_road": 8.0, "cone_merge": 3.4}  # s, mean between vehicles of one arm
+INTERVALS = {"all_way_stop": 7.0, "priority_road": 8.0, "cone_merge": 3.4, "zebra": 7.0, "midblock": 7.0}
+"""Mean time between vehicles of one arm, s."""
+PEOPLE = (-1.2, -0.4, 0.4, 1.2)  # m along the road, where people cross
+WALK, KERB = 13.0, 4.5  # m from the middle of the road, where they come from, and where they wait
+BEFORE_PEOPLE = 6.0  # m from the middle of the crossing to the line of vehicles
+SEES_PEOPLE = 0.5  # share of the critical gap within which people come for whom drivers wait
+PACE, PEOPLE_INTERVAL, PERSON = (1.1, 1.7), 30.0, (0.5, 0.55, 1.75)  # m/s; s between those of one place; m
 HEADWAY = 2.0  # s, least time between them
 TURN_SHARE = 0.1  # of vehicles, to either side
 HURRY = 2.5  # m/s^2, of those who take another's turn at a merge
@@ -70,7 +78,7 @@ POST = (-11.0, 11.0)  # m, place of the sensor
 @dataclass(frozen=True, eq=False)
 class Routes:
     """R routes: points (G, 2) every `GRID` m of each; the arm by which it comes and that to which it leads,
-    rank (R,), the line, m along it; and of each pair r, q
+    rank (R,), the line, m along it, whether people walk it; and of each pair r, q
     (R, R): along r, m, where it comes near q, where it has left it, and up to where both are one."""
 
     points: tuple[FloatArray, ...]
@@ -82,6 +90,7 @@ class Routes:
     enter: FloatArray
     leave: FloatArray
     shared: FloatArray
+    walks: BoolArray
 
     @classmethod
     def along(
@@ -92,20 +101,22 @@ class Routes:
         rank: IntArray,
         turns: BoolArray,
         line: FloatArray,
+        walks: BoolArray | None = None,
     ) -> Routes:
-        """Routes through points."""
+        """Routes through points; of vehicles if `walks` is not given."""
         n = len(points)
+        walks = np.zeros(n, dtype=np.bool_) if walks is None else walks
         enter, leave, shared = np.full((n, n), np.inf), np.full((n, n), -np.inf), np.zeros((n, n))
         for r, mine in enumerate(points):
             for q, other in enumerate(points):
                 near = np.linalg.norm(mine[:, None] - other, axis=-1).min(axis=1) < WIDTH
                 if arm[r] == arm[q]:
                     shared[r, q] = np.inf if near.all() else GRID * np.argmin(near)
-                elif near.any():
+                elif near.any() and not (walks[r] and walks[q]):
                     enter[r, q], leave[r, q] = GRID * np.flatnonzero(near)[[0, -1]]
                     if leads_to[r] == leads_to[q]:
                         leave[r, q] = min(leave[r, q], enter[r, q] + JOINED)
-        return cls(tuple(points), arm, leads_to, rank, turns, line, enter, leave, shared)
+        return cls(tuple(points), arm, leads_to, rank, turns, line, enter, leave, shared, walks)
 
     @property
     def length(self) -> FloatArray:
@@ -152,6 +163,17 @@ def merge_routes() -> Routes:
     return Routes.along(points, np.arange(2), none, none, none > 0, np.full(2, MERGE - TAPER))
 
 
+def people_routes(priority: bool) -> Routes:
+    """A road of two lanes, and people who cross it in either direction."""
+    points = [np.array([[-ARM * u, -OFFSET * u], [ARM * u, -OFFSET * u]]) for u in (1, -1)]
+    points += [np.array([[x, -WALK * u], [x, WALK * u]]) for x, u in zip(PEOPLE, (1, -1, 1, -1), strict=True)]
+    arm = np.arange(len(points))
+    walks = arm >= 2
+    line = np.where(walks, WALK - KERB, ARM - BEFORE_PEOPLE)
+    rank = (walks != priority).astype(np.int64)
+    return Routes.along([_resampled(each) for each in points], arm, arm, rank, arm < 0, line, walks)
+
+
 def _resampled(points: FloatArray) -> FloatArray:
     """The points of a line every `GRID` m."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
@@ -175,9 +197,11 @@ class CrossingTraffic:
     def __init__(self, rule: Rule, until: float, rng: np.random.Generator, takers: float = TAKERS) -> None:
         self.merging = rule == "cone_merge"
         self.routes = merge_routes() if self.merging else crossing_routes(rule == "priority_road")
-        interval = INTERVALS[rule]
+        if rule in ("zebra", "midblock"):
+            self.routes = people_routes(rule == "zebra")
         arm, start = [], []
         for number in np.unique(self.routes.arm).tolist():
+            interval = PEOPLE_INTERVAL if self.routes.walks[self.routes.arm == number].all() else INTERVALS[rule]
             times = np.cumsum(HEADWAY + rng.exponential(interval - HEADWAY, int(2 * until / interval) + 8))
             times = times[times < until] - HEADWAY
             arm.append(np.full(len(times), number))
@@ -187,9 +211,15 @@ class CrossingTraffic:
         share = np.where(self.routes.turns, TURN_SHARE, 1 - 2 * TURN_SHARE)
         odds = share * (self.routes.arm == np.concatenate(arm)[:, None])
         self.route = (np.cumsum(odds / odds.sum(axis=1, keepdims=True), axis=1) > rng.random((n, 1))).argmax(axis=1)
+        self.walks = self.routes.walks[self.route]
         self.fleet: Fleet = sample_fleet(n, float(rng.uniform(9.0, 13.0)), KINDS, rng)
+        if self.walks.any():
+            one, walks = self.fleet.drivers, self.walks
+            pace, near = np.where(walks, rng.uniform(*PACE, n), one.desired_speed), np.where(walks, 0.5, 1.0)
+            slow = replace(one, desired_speed=pace, minimum_gap=near * one.minimum_gap)
+            self.fleet = replace(self.fleet, size=np.where(walks[:, None], PERSON, self.fleet.size), drivers=slow)
         self.bold = rng.random(n) < takers
-        self.critical = rng.uniform(*CRITICAL_GAP, n)
+        self.critical = rng.uniform(*CRITICAL_GAP, n) * np.where(self.walks.any() & ~self.walks, SEES_PEOPLE, 1.0)
         self.s, self.speed, self.time = np.zeros(n), 0.8 * self.fleet.drivers.desired_speed, 0.0
         self.entered, self.committed = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
         self.stood = np.full(n, rule != "all_way_stop")
@@ -241,7 +271,7 @@ class CrossingTraffic:
         for k in np.flatnonzero(~self.entered & (self.start <= self.time)).tolist():
             mine = np.flatnonzero(self.on_road & (self._arm == self._arm[k]))
             last = mine[self.s[mine].argmin()] if len(mine) else None
-            if last is None or self.s[last] > ROOM:
+            if last is None or self.s[last] > (ROOM if not self.walks[k] else PERSON[0] + 1):
                 self.entered[k] = True
                 self.speed[k] = self.speed[k] if last is None else min(self.speed[k], self.speed[last])
 
@@ -309,7 +339,8 @@ def build_crossing(
     fleet = traffic.fleet
     names = np.array([f"vehicle-{k:03d}" for k in range(len(fleet))])
     yaw = np.unwrap(heading, axis=0)
-    vehicles = SimulatedTrajectories(names, fleet.label, fleet.size, time, position, velocity, yaw, present)
+    label = np.where(traffic.walks, "pedestrian", fleet.label)
+    vehicles = SimulatedTrajectories(names, label, fleet.size, time, position, velocity, yaw, present)
     cones = _cones(error) if traffic.merging else Boxes.empty()
     marks = static_objects(np.array([f"cone-{k:03d}" for k in range(len(cones))], dtype=np.str_), cones, time)
     pose = yaw_transform(*POST, 0.0, 0.0)

@@ -31,14 +31,14 @@ from benchmarks.runner import Row, Rows, chosen
 from pipelines.cli.options import Config
 from pipelines.config import TrackConfig, load_config
 from pipelines.tracking import one_thread
-from saga_fg.model import NodeTable
+from saga_fg.model import NodeTable, Paths
 from saga_fg.numerics import BoolArray, FloatArray, IntArray
 from saga_fg.tracking.edge_record import HaltingPlaces
 from saga_fg.tracking.prediction import SHARPEST_TURN, STEPS
-from saga_fg.tracking.right_of_way import INTERVAL, JOINS, RightOfWay
+from saga_fg.tracking.right_of_way import INTERVAL, JOINS, PERSON, WALKS, RightOfWay
 from saga_fg.tracking.track_filters import MOVING, Kinematics
 from saga_fg.tracking.traffic import STEP as PATH_STEP
-from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings, paths
+from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings, paths, straight_paths
 from saga_fg.types import RELATIONS, Tracks
 
 FITTED = 0  # first seed of scenes to which the weights are fitted
@@ -49,6 +49,7 @@ FIT_DURATION, FIT_SETTLES, THINNED = 120.0, 5.0, 3  # s of a scene; s not used; 
 POSITION, SPEED, KEPT, YAW = 0.12, 0.15, 0.7, 0.03  # m, m/s, share of it that lasts, rad: errors of vehicles
 UNITS, DECAY = 8, 1e-5  # hidden units; weight of the squares of all weights
 JOINING_UNITS = 10, 2e-5  # of those that tell who takes the right of way
+WALKING_UNITS = 4, 1e-4  # of those that tell who of a person and a vehicle yields
 
 RULES = ",".join(get_args(Rule))
 
@@ -148,18 +149,24 @@ def vehicles_of(tracks: Tracks, world: CrossingWorld, moment: int) -> dict[int, 
 
 
 def fitted_rows(rules: list[Rule], seeds: range, takers: float) -> Iterator[Row]:
-    """The weights fitted to scenes: of the hidden units a row for each piece of evidence, and the constant ones.
+    """The weights fitted to scenes: of hidden units a row for each piece of evidence and the constant, then their own.
 
-    Each relation has units of its own, the second one those of `JOINING_UNITS`, fitted where ways come together.
+    Each relation has units of its own, the second one those of `JOINING_UNITS`, fitted where ways come together; so
+    have pairs of a person and a vehicle.
     """
     pieces = [piece for rule in rules for seed in seeds for piece in judged_pairs(rule, seed, takers)]
     evidence, answer = (np.concatenate(each) for each in zip(*pieces, strict=True))
-    joins = evidence[:, JOINS] > 0
-    yielding, first = fitted_weights(evidence[::THINNED], answer[::THINNED, 0], UNITS, DECAY)
-    taking, second = fitted_weights(evidence[joins], answer[joins, 1], *JOINING_UNITS)
-    for title, rows in (("YIELDING", yielding), ("TAKING", taking), ("WEIGHTS", (first, second))):
-        for row in rows:
-            yield title, {f"{number}": round(float(value), 2) for number, value in enumerate(row)}
+    joins, person = evidence[:, JOINS] > 0, evidence[:, WALKS] != 0
+    parts = {
+        "YIELDING": (np.flatnonzero(~person)[::THINNED], 0, UNITS, DECAY),
+        "TAKING": (np.flatnonzero(joins), 1, *JOINING_UNITS),
+        "WALKING": (np.flatnonzero(person)[::THINNED], 0, *WALKING_UNITS),
+    }
+    for title, (rows, relation, units, decay) in parts.items():
+        if len(rows):
+            given = evidence[rows] if title == "WALKING" else np.delete(evidence[rows], WALKS, axis=1)
+            for row in (*(found := fitted_weights(given, answer[rows, relation], units, decay))[0], found[1]):
+                yield title, {f"{number}": round(float(value), 2) for number, value in enumerate(row)}
 
 
 def judged_pairs(rule: Rule, seed: int, takers: float) -> Iterator[tuple[FloatArray, BoolArray]]:
@@ -185,7 +192,10 @@ def judged_pairs(rule: Rule, seed: int, takers: float) -> Iterator[tuple[FloatAr
         halting = halting.later(nodes, np.ones(len(rows), dtype=np.bool_), time)
         lasting = np.maximum(speed, MOVING)[:, None]
         sharpest = SHARPEST_TURN / lasting * np.concatenate([0 * lasting + INTERVAL, PATH_STEP / lasting], axis=1)
-        ways = paths(traffic, rows, position, yaw, 0 * speed, sharpest, STEPS).select(np.flatnonzero(moved))
+        walks = label == PERSON
+        ways = paths(traffic, rows, position, yaw, 0 * speed, sharpest, STEPS)
+        people = straight_paths(rows, position, yaw, STEPS).select(np.flatnonzero(walks))
+        ways = Paths.concatenate([ways.select(np.flatnonzero((moved > 0) & ~walks)), people])
         known, pairs, evidence = known.observed(nodes, ways, halting.lines, time)
         if pairs and time >= FIT_SETTLES:
             i, j = np.array(pairs).T

@@ -33,11 +33,11 @@ from saga_fg.kernels.paths import mean_courses
 from saga_fg.model import Curvilinear, KnownCourses, NodeTable, Paths, Unseen, build_graph, turning_time
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, of_classes, unchecked, wrap_angle
 from saga_fg.tracking.edge_record import answers
-from saga_fg.tracking.right_of_way import INTERVAL
+from saga_fg.tracking.right_of_way import INTERVAL, PERSON
 from saga_fg.tracking.track_filters import MOVING, TURNING, Kinematics
 from saga_fg.tracking.track_life import reported_rows, untrackable
 from saga_fg.tracking.tracker_state import TrackerState
-from saga_fg.tracking.traffic import STEP, paths
+from saga_fg.tracking.traffic import STEP, paths, straight_paths
 from saga_fg.types import VEHICLES, PredictedMode, PredictedTracks
 
 ACROSS = 0.3  # m/s, deviation of the velocity of a vehicle across its path: it moves within its lane
@@ -215,8 +215,18 @@ def judge_edges(state: TrackerState) -> None:
         unmoved = np.flatnonzero(able & ~table.has_moved)
         place = nodes.position[unmoved] + state.origin
         able[unmoved] = ~state.traffic.passes_beside(table.box.yaw[unmoved], place)  # else it is parked
-        paths = predicted_paths(state, able, INTERVAL)
+        ways = [predicted_paths(state, able, INTERVAL), _walked_paths(state, nodes)]
+        paths = Paths.concatenate(ways)
+        paths = paths.select(np.argsort(paths.row))
         state.right_of_way = state.right_of_way.later(nodes, paths, state.halting.lines, time)
+
+
+def _walked_paths(state: TrackerState, nodes: NodeTable) -> Paths:
+    """The paths of people."""
+    table = state.table
+    rows = np.flatnonzero(table.confirmed & (table.label == PERSON))
+    found = straight_paths(table.id[rows], nodes.position[rows], nodes.heading[rows], STEPS)
+    return unchecked(Paths, **vars(found) | {"row": rows})
 
 
 def _predict_stationarity(state: TrackerState, dt: float) -> FloatArray | None:

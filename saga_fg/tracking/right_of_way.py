@@ -6,6 +6,9 @@ unless one is behind the other there or they pass head on. A vehicle waits at th
 before that point (`saga_fg.tracking.edge_record`), else `CROSSING` or `JOINING` m before it, and has arrived
 `ARRIVES` m before this line.
 
+People who walk go straight on, and stand `STANDS` m before the middle of the way of vehicles; who waits for whom of a
+person and a vehicle is told alike, by weights of its own.
+
 For each ordered pair i, j the evidence e (`_evidence`) holds distances, speeds, times, who leads, where traffic halts
 and the order of arrival. One model tells two relations, as both rest on who should go first, and who does: i yields to
 j; or i takes the right of way of j, where i should wait and goes, and j brakes or would have to. Their probabilities:
@@ -33,9 +36,9 @@ from scipy.special import expit
 
 from saga_fg.kernels.paths import path_meetings
 from saga_fg.model import NodeTable, Paths, ahead_and_aside, unit
-from saga_fg.numerics import FloatArray, IntArray
+from saga_fg.numerics import BoolArray, FloatArray, IntArray
 from saga_fg.tracking.edge_record import Lines
-from saga_fg.tracking.right_of_way_weights import HIDDEN, OUT
+from saga_fg.tracking.right_of_way_weights import HIDDEN, OUT, PEOPLE, WALKING
 from saga_fg.tracking.traffic import STEP as PATH_STEP
 from saga_fg.types import RELATIONS, Relations
 
@@ -47,15 +50,20 @@ SPACING, BEHIND = 1.0, 5  # m between points of a path, and how many of them are
 NEAR = 1.5  # m between paths that meet
 ALIKE, HEAD_ON = 0.8, -0.9  # cosine between courses that come together, and of those that pass head on
 LOOKS, AHEAD, FARTHEST = 25.0, 5.0, 60.0  # m, and s, for which paths are followed, to so many m
+WALKED = 8.0  # m, likewise, of those of people
 CROSSING, JOINING = 5.0, 20.0  # m before a meeting point, where vehicles wait at unknown lines
+STANDS = 2.5  # m, likewise, of people
 ARRIVES, SOON = 4.0, 0.5  # m before the line; s, in which a vehicle arrives at the earliest that has not
 STAYS = 3.0  # s from there until a vehicle that halts for nobody goes on
 AT_LINE, PASSED, HARDEST = 0.3, 1.0, 4.0  # m before and beyond a line, where vehicles stand and have left; m/s^2
 GOES, CRUISE, SLOW = 1.8, 10.0, 2.0  # m/s^2 and m/s of a vehicle that goes on freely; m/s
+LINGERS = 1.0  # m/s, as `SLOW`, of people
 
 Pair = tuple[int, int]
+PERSON = "pedestrian"
 YIELDS, TAKES = 0, 1  # among `RELATIONS`
 JOINS = 22  # column of evidence: 1 where the ways come together, 0 where they cross
+WALKS = 26  # 1 where the first one is a person, -1 where the second one is, 0 where none is
 
 
 class Meetings(NamedTuple):
@@ -153,20 +161,23 @@ class RightOfWay:
         ids, half = nodes.id[rows].tolist(), nodes.length[rows] / 2
         speed = np.maximum(np.einsum("ni,ni->n", nodes.velocity[rows], unit(heading)), 0.0)
         motion = self._motion(ids, speed.tolist(), time)
-        meetings, lead = _meetings(paths, nodes.position[rows], heading, speed)
+        walks = nodes.label[rows] == PERSON
+        slow = np.where(walks, LINGERS, SLOW)
+        meetings, lead = _meetings(paths, nodes.position[rows], heading, speed, walks)
         to_line, halts, alone = lines.next_of(nodes.position[rows], heading)
         usual = np.full(len(rows), np.inf)
-        before = meetings.way - half[meetings.rows] - np.where(meetings.cosine > ALIKE, JOINING, CROSSING)[:, None]
+        usually = np.where(walks[meetings.rows], STANDS, np.where(meetings.cosine > ALIKE, JOINING, CROSSING)[:, None])
+        before = meetings.way - half[meetings.rows] - usually
         np.minimum.at(usual, meetings.rows, before)
         to_line = np.where(np.isfinite(to_line), to_line, usual)
         near = {node: d for node, d in zip(ids, to_line.tolist(), strict=True) if d <= LOOKS}
         arrived = {
             node: self.arrived.get(node, time) for node, d in near.items() if d < ARRIVES or node in self.arrived
         }
-        comes = time + np.maximum((to_line - ARRIVES) / np.maximum(speed, SLOW), SOON)
+        comes = time + np.maximum((to_line - ARRIVES) / np.maximum(speed, slow), SOON)
         arrival = np.minimum(comes, [arrived.get(node, math.inf) for node in ids])
         acceleration = np.array([motion[node][1] for node in ids])
-        columns = np.column_stack([half, speed, acceleration, to_line, halts, lead, arrival])
+        columns = np.column_stack([half, speed, acceleration, to_line, halts, lead, arrival, walks])
         pairs = [(ids[i], ids[j]) for i, j in meetings.rows.tolist()]
         crossing = np.flatnonzero(meetings.cosine <= ALIKE)  # those who come together do not halt
         place = nodes.position[rows] + np.minimum(to_line, FARTHEST)[:, None] * unit(heading)
@@ -189,8 +200,9 @@ class RightOfWay:
 
 def probabilities(evidence: FloatArray) -> FloatArray:
     """The probability (E, 2) of each of `RELATIONS` from the first of each pair to the second, by evidence (E, F)."""
-    hidden = np.tanh(evidence @ HIDDEN[:-1] + HIDDEN[-1])
-    found = expit(hidden @ OUT[:-1] + OUT[-1])
+    found, person = np.zeros((len(evidence), 2)), evidence[:, WALKS] != 0
+    for rows, hidden, out in ((~person, HIDDEN, OUT), (person, WALKING, PEOPLE)):
+        found[rows] = expit(np.tanh(evidence[rows] @ hidden[:-1] + hidden[-1]) @ out[:-1] + out[-1])
     found[:, TAKES] = np.where(evidence[:, JOINS] > 0, found[:, TAKES], 0.0)
     return np.asarray(found)
 
@@ -204,9 +216,10 @@ def free_time(distance: FloatArray, speed: FloatArray) -> FloatArray:
 
 
 def _meetings(
-    paths: Paths, position: FloatArray, heading: FloatArray, speed: FloatArray
+    paths: Paths, position: FloatArray, heading: FloatArray, speed: FloatArray, walks: BoolArray
 ) -> tuple[Meetings, FloatArray]:
-    """Where vehicles meet, each pair in both orders, and the distance (k,), m, to the next one before each."""
+    """Where vehicles meet, and people who cross their ways, each pair in both orders; and the distance (k,), m, to the
+    next vehicle before each."""
     step = np.arange(0.0, 1.0, SPACING / PATH_STEP)[:, None]
     begin, piece = paths.position[:, :-1, None], np.diff(paths.position, axis=1)[:, :, None]
     onward = (begin + step * piece).reshape(len(paths), begin.shape[1] * len(step), 2)
@@ -214,9 +227,13 @@ def _meetings(
     points = np.concatenate([behind, onward], axis=1)
     course = np.repeat(paths.heading[:, 1:], len(step), axis=1)
     course = np.concatenate([np.repeat(heading[:, None], BEHIND, axis=1), course], axis=1)
-    reach = (np.minimum(LOOKS + AHEAD * speed, FARTHEST) / SPACING).astype(np.int64) + BEHIND
-    reach = np.minimum(reach, points.shape[1])
+    far = np.where(walks, WALKED, np.minimum(LOOKS + AHEAD * speed, FARTHEST))
+    reach = np.minimum((far / SPACING).astype(np.int64) + BEHIND, points.shape[1])
     pair, at = path_meetings(points, reach, NEAR, SPACING)
+    crosses = np.abs(np.cos(np.subtract(*course[pair, at].T))) < ALIKE
+    people = walks[pair].sum(axis=1)
+    kept = (people == 0) | ((people == 1) & crosses)
+    pair, at = pair[kept], at[kept]
     way, angle = SPACING * (at - BEHIND), course[pair, at]
     cosine = np.cos(angle[:, 0] - angle[:, 1])
     lead, begins = np.full(len(paths), np.inf), way <= SPACING
@@ -232,10 +249,10 @@ def _meetings(
 
 
 def _evidence(meetings: Meetings, columns: FloatArray) -> FloatArray:
-    """(E, F) evidence on pairs i, j, of order one, by half lengths, speeds and so on (k, 7) of vehicles."""
-    half, speed, acceleration, to_line, halts, lead, arrival = np.moveaxis(columns[meetings.rows], 2, 0)
+    """(E, F) evidence on pairs i, j, of order one, by half lengths, speeds and so on (k, 8) of each."""
+    half, speed, acceleration, to_line, halts, lead, arrival, walks = np.moveaxis(columns[meetings.rows], 2, 0)
     front, later = meetings.way - half, np.clip(arrival[:, 0] - arrival[:, 1], -3.0, 3.0)
-    comes = np.maximum(front, 0.0) / np.maximum(speed, SLOW)
+    comes = np.maximum(front, 0.0) / np.maximum(speed, np.where(walks > 0, LINGERS, SLOW))
     braking = speed**2 / (8 * np.maximum(to_line, 0.3))
     both = (
         np.clip(front, -5.0, 50.0) / 20,
@@ -250,4 +267,5 @@ def _evidence(meetings: Meetings, columns: FloatArray) -> FloatArray:
         np.clip(lead - meetings.way, -8.0, 8.0) / 8,
         halts,
     )
-    return np.column_stack([*both, meetings.cosine > ALIKE, meetings.cosine, np.tanh(2 * later), later / 2])
+    first = walks[:, 0] - walks[:, 1]
+    return np.column_stack([*both, meetings.cosine > ALIKE, meetings.cosine, np.tanh(2 * later), later / 2, first])

@@ -4,6 +4,7 @@
 The first eight hidden units tell who yields; they were fitted by `python -m benchmarks right-of-way --fit --scenes 9`
 to scenes of two minutes of an all-way stop, a priority road, and a merge between cones, with a taker among ten drivers.
 The others tell who takes the right of way; they were fitted to 32 such merges, with three to six takers among ten.
+Those of a person and a vehicle were fitted by `--rules zebra,midblock --fit --scenes 4`, with three takers.
 """
 
 import numpy as np
@@ -72,10 +73,44 @@ TAKING = np.array(
         [-0.17, -0.37, 0.11, 0.35, 0.40, -0.33, -0.09, 0.20, -0.11, -0.35],
     ]
 )
-HIDDEN = np.hstack([YIELDING, TAKING])
+HIDDEN = np.insert(np.hstack([YIELDING, TAKING]), -1, 0.0, axis=0)  # among vehicles nobody walks
 # a row for each relation, its constant the last
 WEIGHTS = [
     [3.01, -3.68, -3.63, 1.40, 3.63, -4.55, -3.59, -2.88, -4.67],
     [1.37, 2.50, 3.40, -1.75, -2.35, 4.84, 1.90, -3.63, 1.64, 2.68, -1.45],
 ]
 OUT = np.vstack([block_diag(*(np.array(each[:-1])[:, None] for each in WEIGHTS)), [each[-1] for each in WEIGHTS]])
+# of pairs of a person and a vehicle
+WALKING = np.array(
+    [
+        [0.01, 0.86, 3.23, 0.10],
+        [0.03, -1.37, -0.88, -0.14],
+        [-0.08, -1.25, 0.09, 0.49],
+        [-0.11, -0.88, 0.02, 0.18],
+        [0.13, -0.94, -7.07, 0.56],
+        [0.13, 0.95, 0.70, -0.06],
+        [0.00, 0.47, 3.17, 1.33],
+        [0.05, -0.91, -0.01, 0.78],
+        [-0.01, 0.35, 0.01, -1.39],
+        [-0.12, 0.12, 0.08, -0.22],
+        [-0.12, -0.10, -0.97, -1.11],
+        [-0.15, 2.30, -0.31, -1.67],
+        [-0.02, 0.59, -0.58, 0.75],
+        [-0.33, 0.53, 0.82, 0.93],
+        [-0.13, 0.23, -6.14, 2.55],
+        [-0.20, -0.14, 0.30, 2.14],
+        [-0.14, -0.53, 1.72, -0.03],
+        [-0.31, -0.15, -0.08, 0.12],
+        [-0.06, 0.42, 2.39, -0.16],
+        [-0.46, 0.19, 0.16, -0.18],
+        [-0.15, -0.20, 0.19, 1.02],
+        [-0.12, 0.39, -0.19, -0.61],
+        [-0.02, 0.05, -0.01, 0.05],
+        [-0.02, -0.31, 0.04, -0.21],
+        [0.04, -0.13, 0.02, 1.11],
+        [0.06, 0.09, 0.19, -0.07],
+        [0.05, -0.45, -3.05, -0.05],
+        [-0.46, 1.07, 0.06, -0.06],
+    ]
+)
+PEOPLE = np.column_stack([[1.07, -7.40, 4.15, -3.34, -1.28], [0.0] * 5])  # nobody takes the right of way

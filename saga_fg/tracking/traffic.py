@@ -362,6 +362,13 @@ def paths(
     return Paths(np.arange(len(ids)), *found)
 
 
+def straight_paths(ids: IntArray, position: FloatArray, heading: FloatArray, steps: int) -> Paths:
+    """The paths of those who go straight on, see `paths`."""
+    none = np.zeros((len(ids), 2))
+    return paths(_NO_TRAFFIC, ids, position, heading, none[:, 0], none, steps)
+
+
+_NO_TRAFFIC = Traffic(TrafficSettings(reach=0.0))
 _FARTHEST = 80.0  # exponent from which a passage is too far away to count among the digits
 HEADING_SCALE = 0.3  # sigma of the kernel on the difference of headings, rad
 SPREAD = 2.0  # standard deviation of the difference between the speeds of neighbours, m/s

@@ -8,9 +8,9 @@ import pytest
 from benchmarks import right_of_way
 from benchmarks.crossings import CrossingWorld, Rule, build_crossing, crossing_scene
 from benchmarks.right_of_way import Told, judged_pairs
-from saga_fg.tracking.right_of_way import JOINS, probabilities
+from saga_fg.tracking.right_of_way import JOINS, WALKS, probabilities
 
-RULES: tuple[Rule, ...] = ("all_way_stop", "priority_road", "cone_merge")
+RULES: tuple[Rule, ...] = ("all_way_stop", "priority_road", "cone_merge", "zebra", "midblock")
 
 
 @cache
@@ -24,6 +24,8 @@ def test_vehicles_under_a_rule_wait_and_do_not_collide(rule):
     n = here.yields.shape[1]
     place = np.where(here.objects.present[:, :n, None], here.objects.position[:, :n], np.nan)
     away = np.linalg.norm(place[::10, :, None] - place[::10, None], axis=-1)
+    walks = here.objects.label[:n] == "pedestrian"
+    away[:, walks[:, None] & walks] = np.inf
     away[:, np.arange(n), np.arange(n)] = np.inf
     assert np.nanmin(away) > 1.5
     assert here.yields.any()
@@ -62,6 +64,23 @@ def test_who_takes_the_right_of_way_is_told_where_ways_come_together(monkeypatch
     assert p[takes].mean() > 0.2
     assert p[takes].mean() > 20 * p[~takes].mean()
     assert (p[evidence[:, JOINS] == 0] == 0).all()
+
+
+def test_people_have_priority_at_a_zebra_and_wait_for_gaps_elsewhere(monkeypatch):
+    share = {}
+    for rule in ("zebra", "midblock"):
+        here = crossing(rule)
+        walks = here.objects.label[: here.yields.shape[1]] == "pedestrian"
+        seconds = here.yields.sum(axis=0)
+        cars, people = seconds[~walks][:, walks].sum(), seconds[walks][:, ~walks].sum()
+        assert min(cars, people) > 0
+        share[rule] = cars / (cars + people)
+    assert share["zebra"] > 2 * share["midblock"]
+    monkeypatch.setattr(right_of_way, "FIT_DURATION", 30.0)
+    evidence, answer = (np.concatenate(each) for each in zip(*judged_pairs("zebra", 1001, 0.3), strict=True))
+    p, true = probabilities(evidence)[:, 0], answer[:, 0]
+    assert (evidence[:, WALKS] != 0).all()
+    assert p[true].mean() > 5 * p[~true].mean()
 
 
 def test_figures_of_pairs_and_moments():

@@ -7,11 +7,11 @@ import pytest
 
 from saga_fg import Boxes, Detections, Frame, Tracker, TrackerSettings
 from saga_fg.kernels.paths import path_meetings
-from saga_fg.model import NodeTable
+from saga_fg.model import NodeTable, Paths
 from saga_fg.tracking.edge_record import Lines
 from saga_fg.tracking.right_of_way import RightOfWay, free_time, probabilities
 from saga_fg.tracking.table_tracking import dense_traffic_settings
-from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings, paths
+from saga_fg.tracking.traffic import Passages, Traffic, TrafficSettings, paths, straight_paths
 from saga_fg.types import RELATIONS, Lane, RoadMap, StopLine, TrafficLight
 
 EAST, NORTH = 0.0, np.pi / 2
@@ -47,16 +47,19 @@ def memory(*lines):
 CROSSING = memory(((-30, 0), EAST), ((0, -30), NORTH))
 
 
-def judged(moments, traffic=CROSSING, lines=NOBODY_HALTS):
+def judged(moments, traffic=CROSSING, lines=NOBODY_HALTS, people=()):
     """What is known after moments of (x, y, heading, speed) of vehicles 1, 2, ..., .2 s apart."""
     known = RightOfWay()
     for number, vehicles in enumerate(moments):
         x, y, heading, speed = np.array(vehicles, dtype=float).T
         k, place = len(x), np.column_stack([x, y])
         velocity = speed[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
-        ids, label = np.arange(1, k + 1), np.full(k, "car")
-        nodes = NodeTable(ids, label, (), place, velocity, heading, np.full(k, 4.5), np.full(k, 0.04))
-        ways = paths(traffic, ids, place, heading, np.zeros(k), np.full((k, 2), 0.5), 20)
+        ids = np.arange(1, k + 1)
+        walks = np.isin(ids, people)
+        label = np.where(walks, "pedestrian", "car")
+        nodes = NodeTable(ids, label, (), place, velocity, heading, np.where(walks, 0.5, 4.5), np.full(k, 0.04))
+        ways = paths(traffic, ids, place, heading, np.zeros(k), np.full((k, 2), 0.5), 20).select(np.flatnonzero(~walks))
+        ways = Paths.concatenate([ways, straight_paths(ids, place, heading, 20).select(np.flatnonzero(walks))])
         known = known.later(nodes, ways, lines, 0.2 * number)
     return known
 
@@ -68,6 +71,23 @@ def told(known, name=RELATIONS[0]):
 def waiting_in_the_south(other_x, speed, moments=15):
     """Vehicle 1 stands before the crossing, vehicle 2 comes from the west."""
     return [[(0, -8.0, NORTH, 0.0), (other_x + 0.2 * k * speed, 0, EAST, speed)] for k in range(moments)]
+
+
+def test_a_car_that_brakes_for_a_person_yields_and_a_person_who_lets_one_pass():
+    brakes = [[(-14 + k - 0.04 * k**2, 0, EAST, 5.0 - 0.4 * k), (0, -4.5 + 0.28 * k, NORTH, 1.4)] for k in range(10)]
+    assert told(judged(brakes, people=[2])) == {(1, 2)}
+    passes = [[(-24.0 + 2.0 * k, 0, EAST, 10.0), (0, -4.7, NORTH, 0.0)] for k in range(8)]
+    known = judged(passes, people=[2]).probability
+    assert known[2, 1][0] > 0.5
+    assert known[1, 2][0] < 0.1
+    assert known[1, 2][1] == known[2, 1][1] == 0.0
+
+
+def test_people_are_told_nothing_of_one_another_nor_of_a_car_beside_which_they_walk():
+    crowd = [[(-3 + 0.28 * k, 0, EAST, 1.4), (0, -3 + 0.28 * k, NORTH, 1.4)] for k in range(8)]
+    assert judged(crowd, people=[1, 2]).probability == {}
+    along = [[(-20 + 1.6 * k, 0, EAST, 8.0), (0.28 * k, 0.5, EAST, 1.4)] for k in range(8)]
+    assert judged(along, people=[2]).probability == {}
 
 
 def test_who_waits_where_traffic_halts_yields_to_who_comes():
@@ -181,7 +201,7 @@ def test_free_time_is_that_of_an_even_acceleration_up_to_the_cruising_speed():
 
 
 def test_probabilities_are_finite_for_extreme_evidence():
-    p = probabilities(np.vstack([np.full(26, 1e6), np.full(26, -1e6), np.zeros(26)]))
+    p = probabilities(np.vstack([np.full(27, 1e6), np.full(27, -1e6), np.zeros(27)]))
     assert ((p >= 0) & (p <= 1)).all()
 
 
