@@ -283,3 +283,12 @@ def test_a_false_loop_does_not_bend_the_map():
     spoilt = graph.finish()
     np.testing.assert_array_equal(spoilt.loops.kept, [True] * len(loops) + [False])
     np.testing.assert_allclose(spoilt.world_T_pose, clean.world_T_pose, atol=0.02)
+
+
+def test_drift_beyond_the_noise_does_not_cost_loops():
+    drive, graph, _ = looping(Q, turn=1e-3)  # twice its deviation, always in one direction
+    found = graph.finish()
+    assert found.loops.kept.all()
+    assert found.loops.inflation[0] > 2.0 > found.loops.inflation[1]
+    off = np.linalg.norm(found.world_T_pose[:, :3, 3] - drive.poses[:, :3, 3], axis=1)
+    assert off.max() < 1.0

@@ -14,6 +14,7 @@ from saga_fg.tracking.track_filters import (
     DEVIATION,
     DRIFT,
     HEIGHT_DRIFT,
+    NOISE_SCALE,
     START_RATE,
     STOP_RATE,
     STRAIGHT,
@@ -27,6 +28,7 @@ from tests.saga_fg.traffic_frames import (
     assert_estimators_agree,
     at_pose,
     frame,
+    run,
     seen,
     straight,
     turning_vehicle,
@@ -251,8 +253,17 @@ def test_what_stands_and_what_moves_is_reported_apart_and_so_are_departures():
     assert departing[-1] < 0.01
 
 
+def test_velocities_of_parked_cars_are_better():
+    errors, truth = [], straight(np.stack([np.full(20, 5.0), 200.0 * np.arange(20)], axis=-1), (0.0, 0.0))
+    for settings in (SETTINGS, replace(SETTINGS, stationary_share=0.0)):
+        frames = seen(np.random.default_rng(1), truth, TIMES[:30], noise=0.2)
+        errors.append(np.sqrt(np.mean(run(Tracker(settings), frames)[-1].boxes.velocity ** 2)))
+    assert errors[0] < 0.5 * errors[1]
+
+
 def test_what_is_reported_is_the_mean_and_the_covariance_of_the_mixture():
     stationarity = Stationarity(np.zeros((1, 2)), np.eye(2)[None], np.array([0.25]))
+    assert stationarity.noise_scale == pytest.approx(0.75 + 0.25 * NOISE_SCALE)
     moving = kinematics(position=(8.0, 0.0), velocity=(4.0, 0.0), P=2.0, P_velocity=1.0)
     detected, unseen = (stationarity.reported(moving, np.array([coasting])) for coasting in (False, True))
     assert detected.position[0] == pytest.approx([8.0, 0.0])
