@@ -336,12 +336,12 @@ MOMENTS = {
     "nothing of note": ("time.time", "time.time()"),
 }
 SCRIPT = """
-import logging, os, pathlib, pkgutil, shutil, signal, sys, tempfile, time, weakref
+import json, logging, os, pathlib, pkgutil, shutil, signal, sys, tempfile, time, weakref
+import numba
 import numpy as np
 from data_tools.files.file_access import atomic_directory, write_text
 from pipelines.cli.termination import Terminated, ignore_sigterm, raise_on_sigterm
 from pipelines.scale_out import OutputFolder
-from saga_fg.numerics.arrays import distinct
 
 LABELS = np.array(["a", "b", "a"])  # whose kernel has not been compiled
 
@@ -362,30 +362,39 @@ def signalled(*arguments, **options):
     finally:
         os.kill(os.getpid(), signal.SIGTERM)
 
-folder = pathlib.Path(sys.argv[1])
-(folder / "keep").touch()
+for moment, (where, code) in json.loads(sys.argv[2]).items():  # each in a child of its own
+    sys.stdout.flush()
+    if not (child := os.fork()):
+        break
+    print(moment, os.waitpid(child, 0)[1])
+else:
+    sys.exit()
+folder = pathlib.Path(sys.argv[1]) / moment
+folder.mkdir()
+numba.config.CACHE_DIR = str(folder / "kernels")
+from saga_fg.numerics.arrays import distinct
+
 logging.disable()  # that kernels are compiled
-path, _, name = sys.argv[2].rpartition(".")
+path, _, name = where.rpartition(".")
 owner = pkgutil.resolve_name(path)
 original = getattr(owner, name)
 raise_on_sigterm()
 try:
     setattr(owner, name, signalled)
-    exec(sys.argv[3])
+    exec(code)
     while True:
         time.sleep(0.001)
 except Terminated:
     ignore_sigterm()
-    print("terminated")
+    print("terminated: ", end="")
 """
 
 
-@pytest.mark.parametrize("moment", MOMENTS)
-def test_at_moments_when_an_exception_would_leave_something(tmp_path, moment):
-    command = [sys.executable, "-B", "-c", SCRIPT, str(tmp_path), *MOMENTS[moment]]
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
-    run = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120, env=environment)
-    assert (run.stdout, run.stderr, run.returncode) == ("terminated\n", "", 0)
+def test_at_moments_when_an_exception_would_leave_something(tmp_path):
+    command = [sys.executable, "-B", "-c", SCRIPT, str(tmp_path), json.dumps(MOMENTS)]
+    run = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
+    assert run.stdout.splitlines() == [f"terminated: {moment} 0" for moment in MOMENTS]
+    assert (run.stderr, run.returncode) == ("", 0)
     assert [path for path in tmp_path.rglob("*") if ".tmp" in path.name or path.name.startswith("tmp")] == []
 
 

@@ -36,8 +36,8 @@ def sent(address: Address, seqs: Iterator[int] | range) -> list[dict[str, Any]]:
 
 
 def test_after_a_kill_a_client_goes_on_where_the_state_ends(tmp_path):
-    with serving("--listen", "127.0.0.1:0") as (address, _):
-        whole = sent(address, range(FRAMES))
+    service = stream()
+    whole = [answer for seq in range(FRAMES) for _, answer in service.handle(frame(seq), "me")]
     keeping = ("--listen", str(tmp_path / "s.sock"), "--snapshot", str(tmp_path / "state"), "--every", "0.05")
     with serving(*keeping) as (address, server):
         sent(address, range(15))

@@ -72,13 +72,18 @@ def test_a_poor_odometry_is_made_better_by_landmarks() -> None:
     assert trajectory_errors(found.trajectory, truth, "start").ate < 0.7 * before
 
 
-def test_a_place_that_is_come_back_to_closes_a_loop() -> None:
-    """There and back; the odometry drifts aside."""
+def there_and_back() -> tuple[SimulatedScans, np.ndarray]:
+    """Scans whose recorded poses drift aside, and the true poses."""
     there = drive(36, speed=8.0)
     poses = np.concatenate([there, there[-2::-1]])
     scans = SimulatedScans(0, world_T_lidar=poses)
-    truth = Trajectory(scans.timestamps, poses)
     scans.world_T_ego = np.array([yaw_transform(y=0.02 * k) for k in range(len(poses))]) @ poses
+    return scans, poses
+
+
+def test_a_place_that_is_come_back_to_closes_a_loop() -> None:
+    scans, poses = there_and_back()
+    truth = Trajectory(scans.timestamps, poses)
     settings = LidarSlamSettings(submaps=SubmapSettings(length=8.0), loops=LoopSettings(min_path=10.0), landmarks=False)
     found = lidar_slam(scans, odometry=GivenPoses(scans.world_T_ego, 2e-4, 0.005), settings=settings)
     assert found.loops
@@ -103,11 +108,8 @@ class WithFalseLoop:
 
 
 def test_loops_and_inflation_go_through_the_files(tmp_path: Path) -> None:
-    """There and back by an odometry that drifts more than it says; a false loop is not in the graph that is written."""
-    there = drive(36, speed=8.0)
-    poses = np.concatenate([there, there[-2::-1]])
-    scans = SimulatedScans(0, world_T_lidar=poses)
-    scans.world_T_ego = np.array([yaw_transform(y=0.02 * k) for k in range(len(poses))]) @ poses
+    """Odometry drifts more than it says; a false loop is not in the graph that is written."""
+    scans, _ = there_and_back()
     settings = LidarSlamSettings(submaps=SubmapSettings(length=8.0))
     odometry = GivenPoses(scans.world_T_ego, 1e-3, 5e-3)
     slam = LidarSlam(scans.world_T_ego[0], settings, loops=WithFalseLoop(), odometry=odometry)

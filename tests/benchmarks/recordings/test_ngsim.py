@@ -151,7 +151,6 @@ def test_what_is_wrong_in_a_row_is_named(tmp_path, subtests):
         ("X,A,4,0,car,1,2,0,1,,4.5", r"windows.csv.gz: line 33: expected 12 columns, got 11"),
         ("X,A,4,0,car,east,2,0,1,,4.5,2", r"line 33: x: expected a finite number, got 'east'"),
         ("X,A,4,0.5,car,1,2,0,1,,4.5,2", r"line 33: step: expected a whole number from 0"),
-        ("X,A,4,0,car,1,2,0,-1,,4.5,2", r"line 33: speed: expected a number of at least 0, got -1"),
         ("X,A,4,0,car,1,2,0,1,,0,2", r"line 33: length: expected a number above 0, got 0"),
         ("X,A,,0,car,1,2,0,1,,4,2", r"line 33: scenario, id, type: expected a value"),
         ("X,A,1,0,car,1,2,0,1,,4.5,2", r"A: vehicle 1: expected one state at 0.0 s, there are more"),
