@@ -200,6 +200,7 @@ def test_measurements_and_settings_that_make_no_sense(subtests):
         (lambda: ImuSamples([], np.empty((0, 3)), np.empty((0, 3))), "imu: expected at least one sample, got none"),
         (lambda: ImuSamples([0.1], [[0, 0]], [[0, 0, 0]]), r"imu: acceleration: expected shape \(1, 3\)"),
         (lambda: ImuSamples([-0.1], [[0, 0, 9]], [[0, 0, 0]]), r"imu: dt\[0\]: expected a number of seconds > 0"),
+        (lambda: ImuSamples([0.1], [[0, 0, 9]], [[0, np.inf, 0]]), "imu: angular_rate.*expected a finite number"),
         (lambda: EgoMeasurements(gps=(1.0, 2.0)), "gps: expected GpsFix, got tuple"),
         (lambda: EgoMeasurements(landmarks=[3]), "landmarks: expected Observations by the ids"),
         (lambda: Frame(0.0, "s", Detections.empty(), ego="gps"), "ego: expected EgoMeasurements, got str"),

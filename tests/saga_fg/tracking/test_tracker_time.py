@@ -6,6 +6,7 @@ import pytest
 from saga_fg import ConstantVelocity, GreedyTracker, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.model.sensor import NoiseModel
 from saga_fg.tracking import ClassSettings
+from saga_fg.tracking.clock import REMEMBERED, Clock
 from tests.saga_fg.traffic_frames import columns, frame, run, seen, straight
 
 FAST = straight([(0.0, 0.0), (-25.0, 4.0)], [(20.0, 0.0), (22.0, 0.0)])
@@ -310,6 +311,10 @@ def test_tracks_that_outlive_a_jump_are_predicted():
 
 
 def test_names_of_sensors_without_end_are_not_remembered():
+    clock = Clock()
+    for k in range(3 * REMEMBERED):
+        _, clock = clock.judged(0.1 * k, f"sensor {k}", 10.0, 0.5)
+    assert len(clock.accepted) == REMEMBERED
     tracker = Tracker()
     for k in range(200):
         tracker.step(frame(0.1 * k, [(0, 0)], sensor=f"sensor {k}", label=f"class {k}"))
