@@ -2,6 +2,8 @@
 
 Figures of a nuScenes result class by class: ranks, ghosts by kind, objects of two classes, and oracles.
 
+Scores are the means over tracks, by which the official evaluation judges.
+
 left out      least and largest AMOTA with one scene left out
 rank          probability that a box of an object scores higher than one of none; one half: scores say nothing
 ghosts        boxes of no object from the score of the best MOTA on, by the first of these that is so:
@@ -10,7 +12,7 @@ ghosts        boxes of no object from the score of the best MOTA on, by the firs
               coasting      without a detection of their class within the gate
               clutter       all others
 two classes   a frame with two boxes of different classes whose bird's-eye IoU is above `TWICE`, both from the
-              score of the best MOTA of their classes on; of labelled boxes, one pair in a thousand overlaps so much
+              score of the best MOTA of their classes on; in brackets, of labelled boxes
 matching      an oracle: only the tracks that come within the gate of a labelled object of their class at some time
 """
 
@@ -54,7 +56,7 @@ from data_tools.metrics import (
     placed_detections,
     scene_metrics,
 )
-from data_tools.metrics.scene_boxes import near_pairs, nearest_pairs
+from data_tools.metrics.scene_boxes import near_pairs, nearest_pairs, track_means
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.config import Family
 from pipelines.tracking import TrackedScene
@@ -77,10 +79,11 @@ def class_rows(
     matching = nuscenes_tracking_metrics([replace(s, found=s.found.select(_matching(s))) for s in scenes])
     others = [nuscenes_tracking_metrics([s for s in scenes if s is not out]) for out in scenes if len(scenes) > 1]
     thresholds = best_thresholds(found)
+    judged_by = [replace(s, found=replace(s.found, score=_means(s.found))) for s in scenes]
     rows: list[dict[str, Any]] = []
     for label, one in found.per_class.items():
         if one.gt > 0:
-            judged = [_judged(*pair, label) for pair in zip(scenes, detections, strict=True)]
+            judged = [_judged(*pair, label) for pair in zip(judged_by, detections, strict=True)]
             score, kind = (np.concatenate(columns) for columns in zip(*judged, strict=True))
             left_out = [each.per_class[label].amota for each in others if each.per_class[label].gt > 0]
             means = {"AMOTA": one.amota, "AMOTA, matching tracks": matching.per_class[label].amota, "MOTA": one.mota}
@@ -90,8 +93,10 @@ def class_rows(
             rows.append({"class": label, **means, "left out": _span(left_out), **sums})
     yield from rows
     labels = np.array([row["labels"] for row in rows])
-    twice = [frames_with_two_classes(each.found, thresholds) for each in scenes]
-    share = float(np.average(twice, weights=[len(each.timestamps) for each in scenes]))
+    frames = [len(each.timestamps) for each in scenes]
+    labelled = [frames_with_two_classes(each.truth, dict.fromkeys(thresholds, 0.0)) for each in scenes]
+    twice = [frames_with_two_classes(each.found, thresholds) for each in judged_by]
+    share = "{:.3f} ({:.3f})".format(*np.average([twice, labelled], axis=1, weights=frames))
     for name, weight in (("mean", np.ones(len(rows))), ("by labels", labels)):
         means = {key: float(np.average([row[key] for row in rows], weights=weight)) for key in list(rows[0])[1:5]}
         left_out = [each.overall.amota for each in others] if name == "mean" else []
@@ -101,6 +106,10 @@ def class_rows(
 
 def _span(values: Sequence[float]) -> str:
     return f"{min(values):.3f} to {max(values):.3f}" if values else "-"
+
+
+def _means(found: SceneBoxes) -> FloatArray:
+    return track_means(found.score, np.unique(found.id, return_inverse=True)[1])
 
 
 def rank_quality(true: FloatArray, false: FloatArray) -> float:

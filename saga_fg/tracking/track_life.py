@@ -40,6 +40,12 @@ the evidence: a higher probability of any detection lowers no score of the track
 more hit. A weak detection leaves the share g, and a gap multiplies the scores of the boxes in it by r v: misses lower r
 where the object should have been seen, and v where it may be hidden.
 
+Boxes of different classes that overlap by more than `MAX_OVERLAP` are hypotheses of one object, unless a rule of the
+graph attaches the one class to the other. The surer one is that of the higher score with its best detection, s. Above
+`ALIKE` the class is in doubt, as of a car or a truck, where a detector's scores are shares of one: the other one scores
+at most one less the score of the surer. Below, one is part of the other, as a pedestrian on a bicycle: it has 1 - s of
+its score.
+
 A filter's noise is wider than its errors where it also has to let the right detections through the gate, which are not
 as Gaussian as it assumes: the factor c, of sensor and class, corrects this, and h its dependence on the probability p
 of the latest detection. A detector that sees one side of a car misjudges its length, and with it the position of its
@@ -60,7 +66,8 @@ from typing import Any
 import numpy as np
 
 from saga_fg.kernels.components import biased_covariances
-from saga_fg.numerics import BoolArray, FloatArray, IntArray, Matching, unchecked
+from saga_fg.model import Attached
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, Matching, of_classes, unchecked
 from saga_fg.tracking.measurements import FrameMeasurements
 from saga_fg.tracking.relinking import CONFIRMING, initiating, relinkable
 from saga_fg.tracking.settings import ExistenceSettings
@@ -71,7 +78,8 @@ from saga_fg.tracking.update import update_range_rates
 from saga_fg.types import Boxes, Tracks, paired_bev_iou, touching_pairs
 
 OVERLAP = 0.05  # bird's-eye IoU above which a new track is unresolved
-MAX_OVERLAP = 0.2  # largest one of two objects
+MAX_OVERLAP = 0.2  # largest one of two objects, of one class or two
+ALIKE = 0.6  # of boxes of two classes, above which neither is part of the other
 PRECISE = 0.75  # standard deviation of a position, in widths of its box, up to which overlap tells anything
 FRAMES = 2.0  # frames at the start: a box clear of the other three times in all is hardly a second one by chance
 ALONE = 2.0  # frames for a miss: an object is missed less often than a second box, so a miss tells more
@@ -233,12 +241,13 @@ def report_tracks(state: TrackerState, timestamp: float) -> Tracks:
     yaw, (scale, bias) = table.box.yaw[rows], (table.covariance_scale[rows], table.position_bias[rows])
     centre = np.concatenate([now.position + state.origin, table.box.z[rows, None]], axis=1)
     P = biased_covariances(now.P, yaw, scale, bias)
-    score = reported_score(table, rows, coasting > 0, settings.existence)
+    score, best = reported_score(table, rows, coasting > 0, settings.existence)
     score = score * state.confused.certainty(state.class_belief()[rows])
     if settings.tentative_score_factor < 1:
         score = np.where(table.tentative(state.time)[rows], settings.tentative_score_factor * score, score)
     columns = {"label": table.label[rows], "position": centre, "size": table.box.size.take(rows, 0)}
     boxes = unchecked(Boxes, **_frozen(columns | {"yaw": yaw, "velocity": now.velocity}))
+    score = exclusive_score(state, boxes, score, best)
     columns = {"id": table.id[rows], "score": score, "coasting": coasting}
     columns["settled"] = state.joint.settled(columns["id"])
     covariances = {"position_covariance": P, "velocity_covariance": now.P_velocity}
@@ -271,12 +280,37 @@ def known_places(state: TrackerState) -> BoolArray:
     return np.asarray(state.kinematics().deviation <= most)
 
 
-def reported_score(table: TrackTable, rows: IntArray, coasting: BoolArray, settings: ExistenceSettings) -> FloatArray:
-    """(k,) score of the boxes of tracks `rows` (k,); coasting (k,): not detected now."""
+def reported_score(
+    table: TrackTable, rows: IntArray, coasting: BoolArray, settings: ExistenceSettings
+) -> tuple[FloatArray, FloatArray]:
+    """(k,) scores of the boxes of tracks `rows` (k,), and what they are with the best detection of each.
+
+    coasting  (k,) not detected now
+    """
     hits, opportunities = table.sensors.best_hits()
-    hit_ratio = (hits[rows] / (opportunities[rows] + settings.prior_opportunities)) ** settings.hit_ratio_weight
-    evidence = np.maximum(table.score[rows], LASTING_SHARE * table.best_score[rows])
-    return np.asarray(evidence * hit_ratio * np.where(coasting, table.seen_existence[rows], 1.0))
+    share = (hits[rows] / (opportunities[rows] + settings.prior_opportunities)) ** settings.hit_ratio_weight
+    evidence, best = np.maximum(table.score, LASTING_SHARE * table.best_score)[rows], table.best_score[rows]
+    return np.asarray(evidence * share * np.where(coasting, table.seen_existence[rows], 1.0)), np.asarray(best * share)
+
+
+def exclusive_score(state: TrackerState, boxes: Boxes, score: FloatArray, best: FloatArray) -> FloatArray:
+    """(k,) scores of reported boxes (k), which had `score` (k,), where boxes of other classes are in their place.
+
+    best  (k,) scores with the best detection of each track
+    """
+    a, b = touching_pairs(boxes, boxes)
+    rival = (a < b) & ~state.confused.alike(boxes.label[a], boxes.label[b])
+    for rule in state.rules:
+        if isinstance(rule, Attached):
+            part, carrier = of_classes(boxes.label, rule.attached), of_classes(boxes.label, rule.carriers)
+            rival &= ~((part[a] & carrier[b]) | (part[b] & carrier[a]))
+    a, b = a[rival], b[rival]
+    overlap = np.nan_to_num(paired_bev_iou(boxes.select(a), boxes.select(b)))
+    sure, other = np.where(best[a] >= best[b], [a, b], [b, a])[:, overlap > MAX_OVERLAP]
+    alike = overlap[overlap > MAX_OVERLAP] > ALIKE
+    result = score.copy()
+    np.minimum.at(result, other, np.where(alike, 1 - score[sure], (1 - best[sure]) * score[other]))
+    return result
 
 
 log = logging.getLogger(__name__)

@@ -45,3 +45,18 @@ def test_ghosts_are_counted_by_kind():
     }
     assert row["rank"] == 0.5
     assert row["left out"] == "-"
+
+
+def test_frames_with_two_classes_are_judged_by_the_means_of_tracks():
+    objects = [(k, *rest) for k in range(8) for rest in (("a", "car", 0.0, 0.9), ("b", "truck", 30.0, 0.5))]
+    truth = table(objects)
+
+    def shares(*scores):
+        ghost = [(k, "c", "truck", 0.5, scores[k % 2]) for k in range(4)]
+        found = table(sorted([*objects, *ghost]))
+        scene = NuScenesTrackingScene(np.arange(8.0), np.zeros((8, 2)), truth, found)
+        rows = {row["class"]: row for row in class_rows([scene], [(truth.frame, truth.boxes)])}
+        return rows["mean"]["frames with two classes"], rows["truck"]["other class"]
+
+    assert shares(0.6, 0.1) == ("0.000 (0.000)", 0)
+    assert shares(0.9, 0.4) == ("0.500 (0.000)", 4)

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from saga_fg import Boxes, Detections, Frame, InputError, Tracker
+from saga_fg.model.edge_rules import Attached
 from saga_fg.model.motion import ConstantVelocity, RandomWalk
 from saga_fg.model.sensor import Sensor
 from saga_fg.tracking import ClassSettings, TrackerSettings
@@ -170,6 +171,34 @@ def test_without_tables_there_are_two():
     for k in range(4):
         reported = track.step(frame(0.1 * k, (("car", "truck")[k % 2], 20.0)))
     assert sorted(reported.boxes.label.tolist()) == ["car", "truck"]
+
+
+@pytest.mark.parametrize(
+    ("other", "place", "edges", "left"),
+    [
+        (("truck", 0.6), 20.0, (), lambda own, surer: 1 - surer),
+        (("truck", 0.3), 20.0, (), lambda own, surer: own),
+        (("truck", 0.6), 21.5, (), lambda own, surer: own * (1 - surer)),
+        (("truck", 0.6), 23.5, (), lambda own, surer: own),
+        (("car", 0.6), 21.5, (), lambda own, surer: own),
+        (("truck", 0.6), 21.5, (Attached(("truck",), ("car",)),), lambda own, surer: own),
+        (("truck", 0.6), 21.5, (Attached(("trailer",), ("car",)),), lambda own, surer: own * (1 - surer)),
+    ],
+)
+def test_boxes_of_other_classes_in_one_place_exclude_each_other(other, place, edges, left):
+    def scores(*found):
+        plain = ClassSettings(initial_speed_deviation=1.0, nms_distance=0.0)
+        track = Tracker(TrackerSettings({"default": plain}, edges=edges, tentative_score_factor=1.0, max_step=0.1))
+        for k in range(4):
+            reported = track.step(frame(0.1 * k, *found))
+        return dict(zip(reported.boxes.position[:, 0].round(1).tolist(), reported.score.tolist(), strict=True))
+
+    far = 60.0 + place
+    alone = scores(("car", 19.9, 0.7), (other[0], far, other[1]))
+    both = scores(("car", 19.9, 0.7), (other[0], place, other[1]))
+    surer = alone[19.9]
+    assert both[19.9] == pytest.approx(surer)
+    assert both[place] == pytest.approx(left(alone[far], surer))
 
 
 def test_groups_keep_to_themselves_and_ones_own_class_goes_before_a_nearer_other():

@@ -177,7 +177,7 @@ def score(probability, hits, opportunities, coasting=False, existence=0.9, setti
     table = replace(
         TrackTable.empty(), existence=np.full(n, existence), score=probability, best_score=best, sensors=sensors
     )
-    return reported_score(table, np.arange(n), np.full(n, coasting), settings)
+    return reported_score(table, np.arange(n), np.full(n, coasting), settings)[0]
 
 
 def after_miss(r, p_detect, elapsed, settings):
@@ -334,7 +334,7 @@ def test_boxes_of_unknown_extent_are_objects_of_their_own(unknown):
     assert tracks.score.tolist() == [pytest.approx(0.8), pytest.approx(0.6)]
 
 
-def test_other_classes_may_overlap():
+def test_other_classes_share_one_certainty():
     boxes = crowd_frame(0.0, [(0.0, 0.0), (0.0, 0.4)], [0.8, 0.6]).detections
     labels = np.array(["motorcycle", "pedestrian"])
     frame = Frame(
@@ -344,7 +344,7 @@ def test_other_classes_may_overlap():
             Boxes(labels, *(getattr(boxes.boxes, n) for n in ("position", "size", "yaw", "velocity"))), boxes.score
         ),
     )
-    assert Tracker(unresolved_settings()).step(frame).score.tolist() == [pytest.approx(0.8), pytest.approx(0.6)]
+    assert Tracker(unresolved_settings()).step(frame).score.tolist() == [pytest.approx(0.8), pytest.approx(0.2)]
 
 
 @pytest.mark.parametrize("estimator", ["kalman", "isam2", "fixed-lag"])
