@@ -25,12 +25,18 @@ FRAMES = 100  # with tracks, after which a live stream is judged
 SCENES = 3  # of a dataset, whose first frames are judged
 
 
+def options_of(source: DatasetSource) -> Callable[[Mend], str]:
+    """What gives the options of the command that mend a suspicion, of a dataset that has a `TableImport`, `how`."""
+    how = getattr(source, "how", None)
+    return lambda mend: "" if how is None else how.option_for(mend, {})
+
+
 class Checks:
     """Warns of each suspicion once.
 
     settings    of the run
     usual       the shipped settings: what a file for --config adds to them should meet something in the data
-    option_for  the options of the command that mend a suspicion about what no table says, "" for none
+    option_for  the options of the command that mend a suspicion, "" for none
     live_plain  whether live frames that look like dense traffic are told, as --like and --config are left out
     """
 

@@ -168,6 +168,12 @@ def of_own_code(where: str, what: str = "") -> Iterator[None]:
         raise InputError(f"{where}: {what}{in_one_line(error)}") from error
 
 
+def part_name(part: Any) -> str:
+    """MODULE:NAME of a part's class, or of a function."""
+    named = part if hasattr(part, "__qualname__") else type(part)
+    return f"{named.__module__}:{named.__qualname__}"
+
+
 def in_one_line(error: BaseException) -> str:
     """The type and the message of an error."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}"

@@ -10,6 +10,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
+import numpy as np
+
 from data_tools.datasets.detection_files import TableImport, TrackRows, TruthTable, read_tracks, read_truth, track_rows
 from data_tools.datasets.detection_files.dataset import (
     TRUTH_COLUMNS,
@@ -32,8 +34,8 @@ from data_tools.datasets.source import (
 )
 from data_tools.files import expanded, local_copy, name_of
 from saga_fg.errors import InputError
-from saga_fg.tables import NAME, SETTLED, TRACK_COLUMNS, DetectionTable, Table, pairs, raw_table, tell
-from saga_fg.types import Dataset, Scene
+from saga_fg.tables import COLUMNS, NAME, SETTLED, TRACK_COLUMNS, DetectionTable, Table, pairs, raw_table, tell
+from saga_fg.types import Dataset, Scene, data_frame
 
 if TYPE_CHECKING:
     from data_tools.evaluation import Evaluation, Metric
@@ -191,7 +193,7 @@ class DetectionFileSource(DatasetSource):
                 return table_results(rows, result, true_scenes, self.scenes is not None, self.how, judged=True)
         if self.detections is None:
             return table_results(rows, result, None, how=self.how)
-        with self.open() as dataset:
+        with replace(self, columns=None, table_import=_of_detections(self.how)).open() as dataset:
             return table_results(rows, result, dataset, every_scene=truth, how=self.how, own_times=not truth)
 
     def kept(self) -> Mapping[str, Any]:
@@ -218,7 +220,7 @@ class DetectionFileSource(DatasetSource):
         dataset: Dataset = truth
         if self.detections is not None:
             with local_copy(self._table()) as path:
-                dataset = DetectedTruth(truth, read_detections(path, self.how))
+                dataset = DetectedTruth(truth, read_detections(path, _of_detections(self.how)))
         yield dataset if self.scenes is None else ChosenScenes(dataset, self.scenes, f"{self.truth}: --scenes")
 
     def _table(self) -> str:
@@ -228,6 +230,12 @@ class DetectionFileSource(DatasetSource):
                 "and a folder as --output"
             )
         return (self.detections or [""])[0]
+
+
+def _of_detections(how: TableImport | None) -> TableImport:
+    """How to read detections beside tracks or true objects, which alone have the other columns that it names."""
+    how = TableImport() if how is None else how
+    return replace(how, columns={ours: theirs for ours, theirs in how.columns.items() if ours in COLUMNS})
 
 
 def score_tables(
@@ -308,7 +316,8 @@ def evaluate(
     """Judge a table of tracks by one of true objects, as `saga-fg evaluate file TRACKS --truth TRUTH` does.
 
     tracks     a row for each and moment: timestamp, id, x, y, and where known label, score, sizes, covariances, scene,
-               of `saga_fg.track` or of any tracker; pandas, Polars or Arrow
+               of `saga_fg.track` or of any tracker; pandas, Polars or Arrow; what `saga_fg.smooth` returns; `Tracks`
+               or `Labels`, or a list of them
     truth      the same of true objects; `visible` 0 where hidden
     how        what it takes to understand the tables, without effect on tracks of saga-fg; truth_how: that of the truth
     metrics    of your own, as objects or names
@@ -321,6 +330,17 @@ def evaluate(
     return Results(results, score).evaluate(find_spec("trackeval") is not None if hota is None else hota, None, metrics)
 
 
+def _as_table(tracks: Any) -> Table:
+    """A table of labels, `Tracks`, `Labels` or a list of these; a table stays as it is."""
+    if callable(getattr(tracks, "boxes", None)):
+        return tracks.boxes()  # of `saga_fg.smooth`
+    moments = tracks if isinstance(tracks, list | tuple) else [tracks]
+    if not moments or not all(hasattr(moment, "table_columns") for moment in moments):
+        return tracks
+    parts = [moment.table_columns() for moment in moments]
+    return data_frame({name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+
+
 def found_results(
     tracks: Table,
     detections: Table | None = None,
@@ -329,11 +349,12 @@ def found_results(
     truth_how: TableImport | None = None,
 ) -> dict[str, SceneResult]:
     """The tracks of a table by scene, beside detections and true objects where these are given; else as `evaluate`."""
+    tracks = _as_table(tracks)
     names = set(getattr(tracks, "column_names", getattr(tracks, "columns", ())))  # of Arrow, or of the others
     rows = _rows(tracks, TableImport(as_given=True) if names >= OWN else how)
     dataset: Dataset | None = None
     if detections is not None:
-        dataset = DetectionTable(raw_table(detections, how))
+        dataset = DetectionTable(raw_table(detections, _of_detections(how)))
     if truth is not None:
         within = "how" if truth_how is None else "truth_how"
         raw = raw_table(truth, truth_how or how, TRUTH_COLUMNS, TRACK_REQUIRED, within)

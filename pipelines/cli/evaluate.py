@@ -15,7 +15,7 @@ from data_tools.datasets.source import DatasetSource, Innovations, input_files
 from data_tools.evaluation import LEGEND, Evaluation
 from data_tools.figures import write_figures
 from data_tools.files import write_text, write_zip
-from pipelines.checks import CheckedDataset, Checks
+from pipelines.checks import CheckedDataset, Checks, options_of
 from pipelines.cli import options
 from pipelines.cli.console import JsonFile, MarkdownFile, progress_bar, report, show_summary, show_tables, working
 from pipelines.cli.options import ScaleOptions, TrackerOptions, dataset_commands
@@ -91,7 +91,7 @@ def _require_truth(source: DatasetSource) -> None:
 
 def _tracked(source: DatasetSource, settings: TrackConfig, method: Method) -> tuple[Results, Innovations]:
     """Track all scenes, write the result and read it back; and the innovations of the tracker."""
-    checks = Checks(settings.of_method(method))
+    checks = Checks(settings.of_method(method), option_for=options_of(source))
     recorder = InnovationRecorder()
     with TemporaryDirectory() as folder, source.open() as dataset, progress_bar(len(dataset.scenes)) as progress:
         runs = track_dataset(

@@ -13,7 +13,7 @@ from data_tools.datasets.corrections import check_classes, read_corrections, rea
 from data_tools.datasets.given_tracks import GivenTracks, TrackedRecordings, read_given_tracks, tracked_parts
 from data_tools.datasets.source import DatasetSource, input_files
 from pipelines import smoothing
-from pipelines.checks import CheckedDataset, Checks
+from pipelines.checks import CheckedDataset, Checks, options_of
 from pipelines.cli import options
 from pipelines.cli.console import counted, progress_bar
 from pipelines.cli.options import ScaleOptions, Source, TrackerOptions, dataset_commands
@@ -175,7 +175,7 @@ def _track(
     if beside.explain and scale.wanted:
         raise InputError("--explain: goes without --workers and --ray")
     kept, horizons = journal_of(output) if beside.explain else None, options.horizons(beside.predict, method)
-    checks = Checks(settings.of_method(method), load_config(family))
+    checks = Checks(settings.of_method(method), load_config(family), options_of(source))
     if scale.wanted:
         checks.see_first(source)
         task = TrackTask(settings, method, source, horizons)
@@ -266,7 +266,7 @@ def _smooth(
     settings = smoothing.for_given_tracks(settings, given)
     record = LabelRun.of_command(source, method, settings, labels.tracks, labels.corrections).record
     usual = smoothing.load_smooth_config(family).tracking
-    checks = Checks(settings.tracking.of_method(method), usual)
+    checks = Checks(settings.tracking.of_method(method), usual, options_of(source))
     if scale.wanted:
         checks.see_first(source)
         task = SmoothTask(settings, method, source, f".{labels.table}", corrections)

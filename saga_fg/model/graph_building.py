@@ -39,6 +39,7 @@ from saga_fg.model.motion import ConstantVelocity, NodeType, distinct_types
 from saga_fg.model.nonlinear_interactions import AccelerationLaw, held
 from saga_fg.model.scene_graph import Edges, NonlinearEdges, RecordedMotions, SceneGraph
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, checked, checked_rows, unchecked
+from saga_fg.parts import of_own_code, part_name
 from saga_fg.settings import Range, Settings, setting, settings_group
 
 Governing = Callable[[int, NodeTable, IntArray, IntArray], FloatArray]
@@ -328,7 +329,9 @@ def _pairs_of_nodes(rules: Sequence[MovingRule], turns: FloatArray) -> tuple[Sce
         law = rule.interaction
         if not isinstance(law, AccelerationLaw) and applies(law.needs, node_type, node_type):
             total += float(rate.max())
-            groups.append(Edges(type(law).__name__, target, source, rate, *law.triples(nodes, target, source)))
+            with of_own_code(f"interaction {part_name(law)}"):
+                triples = law.triples(nodes, target, source)
+            groups.append(Edges(type(law).__name__, target, source, rate, *triples))
     return SceneGraph.of(nodes.id, node_type, groups), total
 
 

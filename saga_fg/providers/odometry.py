@@ -26,7 +26,7 @@ import gtsam
 import numpy as np
 
 from factors import ERROR_DIM, Pose, between_factor, odometry_factors, pose, pose_prior_factor, prior_factor
-from saga_fg.errors import InputError
+from saga_fg.errors import InputError, require_type
 from saga_fg.graph import EGO_ERROR, EGO_POSE, Additions, GraphView, NewVariable
 from saga_fg.numerics import FloatArray, yaw_of, yaw_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
@@ -162,8 +162,10 @@ class Odometry(Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.errors is not None and self.start.planar:
-            raise InputError("errors: expected poses in space, start.planar: false")
+        if self.errors is not None:
+            require_type("errors", self.errors, OdometryNoise)
+            if self.start.planar:
+                raise InputError("errors: expected poses in space, start.planar: false")
 
     def predict(self, view: GraphView) -> Additions:
         before = view.before(EGO_POSE)

@@ -444,7 +444,7 @@ def smooth(
     """
     given = checked_corrections(corrections)
     found = read_scenes(detections, how, settings, sensors, like, method, estimator)
-    if settings is None:
+    if settings is None or settings.min_hits == TrackerSettings().min_hits:
         found = found._replace(settings=replace(found.settings, min_hits=1))
     labels, outcomes = {}, []
     smoothing = SmoothingSettings(edges=found.like == "plain") if smoothing is None else smoothing

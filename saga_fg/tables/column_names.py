@@ -264,7 +264,7 @@ def understood(
     for ours, name in given.items():
         if name in names and ours in columns:
             chosen[ours] = name
-        elif name and ours in columns and not lenient:
+        elif name and not lenient and name not in names:
             mends[ours] = FILL_IN
             faults.append(f"{naming({ours: name[:40]})}: there is no column {name[:40]!r}")
     taken = set(chosen.values())

@@ -284,7 +284,9 @@ class RawTable:
         given = [row for row, value in enumerate(values) if value is not None]
         nonsense = [row for row in given if not _is_number(values[row], (str, int, float))]
         row = (nonsense or [row for row in given if not _is_number(values[row], kinds)])[0]
-        raise self.fault(row, f"{self.title(name)}: expected a number, got {str(values[row])[:40]!r}")
+        dated = name == "timestamp" and isinstance(values[row], str)
+        dates = ", or a date and time of ISO 8601 (2026-11-28T14:00:00)" if dated else ""
+        raise self.fault(row, f"{self.title(name)}: expected a number{dates}, got {str(values[row])[:40]!r}")
 
     def _yaw_of_quaternions(self, name: str) -> FloatArray:
         """Heading (N,) of rotations w, x, y, z, of which x and y may be missing; NaN where one is left out."""

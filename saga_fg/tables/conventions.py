@@ -197,17 +197,20 @@ _CONVENTIONS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
 """By unit of angles: what they look like, and the heading that is meant by what was read as rad."""
 
 
-def fitting_convention(yaw: FloatArray, velocity: FloatArray, walks: BoolArray) -> tuple[str, str] | None:
+def fitting_convention(
+    yaw: FloatArray, velocity: FloatArray, walks: BoolArray, axes: FloatArray | None = None
+) -> tuple[str, str] | None:
     """The unit of headings (n,), read as rad, of objects that move with `velocity` (n, 2), and how far they are off.
 
-    The unit is "rad" where they fit as they are read, and "" where no convention fits; None where
-    nothing is told, as where too few move.
+    The unit is "rad" where they fit as they are read, "world" where they fit less the heading `axes` (n,) of the frame
+    that they are given in, and "" where no convention fits; None where nothing is told, as where too few move.
     """
     moves = (np.hypot(*velocity.T) > np.where(walks, _WALKS, _MOVES)) & np.isfinite(yaw)
     if moves.sum() < 2 * FEWEST:
         return None
     direction, given = np.arctan2(velocity[moves, 1], velocity[moves, 0]), yaw[moves]
-    meant = {"rad": given, **{unit: convert(given) for unit, (_, convert) in _CONVENTIONS.items()}}
+    world = {} if axes is None else {"world": given - axes[moves]}
+    meant = {"rad": given, **world, **{unit: convert(given) for unit, (_, convert) in _CONVENTIONS.items()}}
     apart = {unit: np.abs(wrap_angle(each - direction)) for unit, each in meant.items()}
     fits = {unit: (share(each > _ASTRAY), float(np.median(each))) for unit, each in apart.items()}
     least = [min(column) for column in zip(*fits.values(), strict=True)]
@@ -233,11 +236,12 @@ def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | Non
 
     Where motion tells nothing, headings beyond a full turn, as in degrees.
     """
-    of_objects = fitting_convention(sample.yaw, motion, sample.walks)
+    axes = np.where(sample.coordinates[sample.frame] == "ego", sample.ego[1], 0.0)
+    of_objects = fitting_convention(sample.yaw, motion, sample.walks, axes)
     none = np.zeros(len(sample.time), dtype=np.bool_)
     of_ego = fitting_convention(sample.ego_yaw, sample.ego_motion, none)
     units = {name: found[0] for name, found in (("yaw", of_objects), ("ego_yaw", of_ego)) if found is not None}
-    wrong = {name: unit for name, unit in units.items() if unit not in ("rad", "")}
+    wrong = {name: unit for name, unit in units.items() if unit not in ("rad", "world", "")}
     if "ego_yaw" in wrong and (sample.coordinates == "ego").any():
         wrong.pop("yaw", None)  # how objects move is not known before
     alike = len(wrong) == 2 and len(set(wrong.values())) == 1
@@ -250,9 +254,11 @@ def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | Non
         return Finding(
             "headings", f"{whose} {looks}: {said}", "expected counter-clockwise from x, rad", Mend(units=wrong)
         )
-    if units.get("yaw") == "":
-        what, mend = f"headings fit no convention: {said}", Mend(columns={"yaw": ""})
-        return Finding("headings", what, "expected the direction of travel, or no headings", mend)
+    if units.get("yaw") in ("world", ""):
+        look = "look like those in the world, beside positions of the vehicle's frame"
+        what = f"headings {look if units['yaw'] else 'fit no convention'}: {said}"
+        expected = f"expected {'yaw - ego_yaw' if units['yaw'] else 'the direction of travel'}, or no headings"
+        return Finding("headings", what, expected, Mend(columns={"yaw": ""}))
     return headings_in_degrees(sample.yaw) if of_objects is None else None
 
 

@@ -59,7 +59,7 @@ from saga_fg.numerics import (
     near_pairs,
     pair_costs,
 )
-from saga_fg.parts import of_own_code
+from saga_fg.parts import of_own_code, part_name
 from saga_fg.tracking.class_belief import NONE_CONFUSED, ConfusedClasses
 from saga_fg.tracking.identities import identity_cost
 from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
@@ -128,11 +128,12 @@ def _own_cost(state: TrackerState, measurements: FrameMeasurements, predicted: B
     )
     total = np.zeros((len(predicted), len(measurements)))
     for k, cost in enumerate(state.costs):
-        with of_own_code(f"association.costs[{k}]"):
+        where = f"association.costs[{k}] ({part_name(cost)})"
+        with of_own_code(where):
             given = np.asarray(cost(problem), dtype=np.float64)
         if given.shape != total.shape or not (given > -math.inf).all():
             what = f"shape {given.shape}" if given.shape != total.shape else "NaN or -infinity"
-            raise InputError(f"association.costs[{k}]: expected numbers of shape {total.shape}, got {what}")
+            raise InputError(f"{where}: expected numbers of shape {total.shape}, got {what}")
         total += given
     return total
 

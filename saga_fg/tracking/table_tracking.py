@@ -13,7 +13,7 @@ import copy
 import warnings
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
@@ -138,7 +138,7 @@ def track(
     sensors     models by name of the sensor; by default the noise of each is told by its detections
     how         what it takes to understand the table: columns, classes, units, coordinates, as_given
     like        dense: settings for road traffic seen by a sensor that stands or hovers; plain: for all else, where
-                tracks are reported from their second detection on
+                tracks are reported from their second detection on; beside settings, for those left at their defaults
     method      saga, kf (without edges, trails and lanes), or centerpoint (greedy nearest centre, with settings of its
                 own)
     estimator   kalman, isam2, fixed-lag, or one of your own, in place of that of the settings
@@ -148,6 +148,7 @@ def track(
     probably wrong, by the checks of `saga-fg inspect`. Raises `InputError` for a table that can't be used, and for one
     whose contents contradict how it is read: units of angles, times, lengths or speeds, coordinates, exchanged columns.
     """
+    _tell_default(settings, like)
     found = read_scenes(detections, how, settings, sensors, like, method, estimator)
     parts = []
     for scene in found.scenes:
@@ -186,6 +187,7 @@ def predict(
     ahead, wanted = checked_horizons(horizons), None if times is None else np.sort(checked("times", times, (None,)))
     if method == "centerpoint":
         raise InputError("method: expected saga or kf, centerpoint predicts nothing")
+    _tell_default(settings, like)
     found = read_scenes(detections, how, settings, sensors, like, method, estimator)
     parts, left_out, spans = [], set(() if wanted is None else wanted.tolist()), []
     for scene in found.scenes:
@@ -205,6 +207,13 @@ def predict(
         some = ", ".join(f"{time:.10g}" for time in sorted(left_out)[:6])
         warnings.warn(f"times: expected seconds {within}; left out: {some}", stacklevel=2)
     return table_like(detections, parts or [found.named("", PredictedTracks.empty(0.0, ahead).table_columns(modes))])
+
+
+def _tell_default(settings: TrackerSettings | None, like: Like | None) -> None:
+    """Warn, at the caller's caller, of a default that fits no table."""
+    if like is None and isinstance(settings, TrackerSettings) and settings.min_hits == TrackerSettings().min_hits:
+        what = f"settings: min_hits is at its default, {settings.min_hits}, where tables without settings have 2"
+        warnings.warn(f"{what}: like='plain' keeps what fits them for all that settings leave out", stacklevel=3)
 
 
 class TableScenes(NamedTuple):
@@ -252,8 +261,6 @@ def read_scenes(
             raise InputError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
     if settings is not None:
         require_type("settings", settings, TrackerSettings)
-        if like is not None:
-            raise InputError(f"like: expected None beside settings, got {like!r}")
     if method == "centerpoint" and (settings, estimator) != (None, None):
         raise InputError("settings, estimator: expected None with method='centerpoint', which has its own")
     sensors = UNKNOWN_SENSORS if sensors is None else checked_sensors(sensors)
@@ -263,9 +270,13 @@ def read_scenes(
     why = seems_dense_traffic(scenes[0].frames) if scenes and undecided else ""
     if why:
         warnings.warn(f"settings for dense traffic: {why}; like='plain' takes others", stacklevel=3)
-    like = like or ("dense" if why else "plain")
+    given, like = like is not None, like or ("dense" if why else "plain")
+    fits, usual = dense_traffic_settings() if like == "dense" else TrackerSettings(min_hits=2), TrackerSettings()
     if settings is None:
-        settings = dense_traffic_settings() if like == "dense" else TrackerSettings(min_hits=2)
+        settings = fits
+    elif given:
+        kept = [each.name for each in fields(usual) if getattr(settings, each.name) == getattr(usual, each.name)]
+        settings = replace(settings, **{name: getattr(fits, name) for name in kept})
     if estimator is not None:
         settings = replace(settings, estimator=estimator)
     settings = settings.of_method(method)

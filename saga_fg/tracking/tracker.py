@@ -24,7 +24,7 @@ from saga_fg.errors import InputError, SagaError, require_type
 from saga_fg.graph import FactorProvider, ProviderError, SceneFactorGraph, UndeterminedError
 from saga_fg.model import SceneGraph, Sensor, checked_sensors, sensor_model
 from saga_fg.numerics import Assignment, FloatArray, IntArray, StrArray
-from saga_fg.parts import KINDS, in_one_line, new_part
+from saga_fg.parts import KINDS, in_one_line, new_part, part_name
 from saga_fg.tracking.association import associate
 from saga_fg.tracking.by_name import estimator_name
 from saga_fg.tracking.clock import TimeVerdict
@@ -148,10 +148,10 @@ class Tracker:
             *((f"association.costs[{k}]", cost) for k, cost in enumerate(self._state.costs)),
             *((f"edges[{k}].interaction", rule.interaction) for k, rule in enumerate(edges)),
             *((f"edges[{k}]", rule) for k, rule in enumerate(edges)),
-            (f"estimator: {estimator_name(settings.estimator)}", self._state.joint.estimator),
+            ("estimator", self._state.joint.estimator),
         ]
         modules = [(getattr(part, "__module__", "saga_fg."), where, part) for where, part in parts]
-        own = [one for one in modules if not one[0].startswith("saga_fg.")]
+        own = [(name, f"{k} ({part_name(p)})", p) for name, k, p in modules if not name.startswith("saga_fg.")]
         calls = [call for call, _ in walk_tb(error.__traceback__)]
         blamed = [where for call in calls for _, where, part in own if call.f_locals.get("self") is part]
         if not blamed:

@@ -5,7 +5,7 @@ from itertools import cycle
 import numpy as np
 import pytest
 
-from benchmarks.conventions import KINDS, SPEEDS, TRAPS, table
+from benchmarks.conventions import KINDS, SPEEDS, TRAPS, _of_ego, table
 from saga_fg import InputError
 from saga_fg.numerics.geometry import wrap_angle
 from saga_fg.tables.column_names import COMMAND, TableImport
@@ -27,6 +27,15 @@ MENDS = {
 def read(made, how=None):
     (scene,) = scenes_of(raw_table(made, how, within=COMMAND))
     return scene
+
+
+@pytest.mark.parametrize("kind", ["queue", "crossing", "parked street"])
+def test_headings_of_the_world_beside_positions_of_the_vehicles_frame_are_named(kind):
+    world = table(kind, np.random.default_rng([88111, *map(ord, kind)]), False)
+    ego = _of_ego(world).assign(coordinates="ego")
+    assert not read(ego).findings
+    with pytest.raises(InputError, match=r"headings look like those in the world.* --columns yaw=;"):
+        refuse_contradictions(read(ego.assign(yaw=world.yaw)).findings)
 
 
 def placed(scene):

@@ -36,6 +36,16 @@ def test_the_figures_are_those_of_the_command(tracks, tmp_path):
     assert found._repr_html_().count("<table>") > 2
 
 
+def test_labels_and_tracks_are_judged_as_they_come(tracks):
+    labels = saga_fg.smooth(DETECTIONS)
+    of_labels, of_table = (saga_fg.evaluate(each, TRUTH).figures() for each in (labels, labels.boxes()))
+    assert str(of_labels) == str(of_table)
+    tracker, moments = saga_fg.Tracker(saga_fg.TrackerSettings(min_hits=2)), saga_fg.frames_of(DETECTIONS)
+    found = [tracker.step(frame) for frame in moments]
+    assert saga_fg.evaluate(found, TRUTH).figures()["tracking"]["overall"]["mota"] > 0.9
+    assert saga_fg.evaluate(found[-1], TRUTH[TRUTH.timestamp == 2.9]).figures()["tracking"]["overall"]["mota"] == 1
+
+
 @pytest.mark.parametrize("options", [{"method": "kf"}, {"method": "centerpoint"}, {"estimator": "isam2"}])
 def test_methods_and_estimators_are_those_of_the_command(options, tmp_path):
     table, result = tmp_path / "found.csv", tmp_path / "tracks.csv"

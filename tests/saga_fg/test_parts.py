@@ -50,6 +50,11 @@ from saga_fg.model.interactions import SharedVelocity
 from saga_fg.settings import NonNegative, setting
 
 @dataclass(frozen=True)
+class Towless(SharedVelocity):
+    def triples(self, nodes, target, source):
+        raise KeyError("hitch")
+
+@dataclass(frozen=True)
 class Drag:
     drag: NonNegative = setting(0.3, "share of the velocity lost per second, 1/s")
     components = ("x", "y", "vx", "vy")
@@ -238,7 +243,7 @@ def test_a_class_model_decides_the_class_of_a_track(mine):
 
 
 def test_what_breaks_is_named(mine, subtests):
-    with pytest.raises(InputError, match=r"edges\[0\]: ZeroDivisionError: division by zero"):
+    with pytest.raises(InputError, match=r"edges\[0\] \(my_parts:Breaks\): ZeroDivisionError: division by zero"):
         run(Tracker(TrackerSettings(edges=(mine.Breaks(),)), {"lidar": Sensor()}))
     for part, message in [
         (
@@ -262,7 +267,7 @@ def test_what_breaks_is_named(mine, subtests):
         return np.zeros(3)
 
     with pytest.raises(
-        InputError, match=r"association.costs\[0\]: expected numbers of shape \(2, 2\), got shape \(3,\)"
+        InputError, match=r"association.costs\[0\] \(.*flat\): expected numbers of shape \(2, 2\), got shape \(3,\)"
     ):
         run(Tracker(TrackerSettings(association=AssociationSettings(costs=(flat,)))))
 
@@ -273,16 +278,27 @@ def test_the_part_that_fails_is_named_also_beside_others_of_its_module(mine, sub
 
     settings = TrackerSettings(classes={"default": ClassSettings(motion=mine.Drag())}, edges=(mine.Chain(),))
     for found, sensor, message in [
-        (costs(mine.alike, mine.missing_key), Sensor(), r"association.costs\[1\]: KeyError: 'key'"),
-        (costs(mine.no_numbers), Sensor(), r"association.costs\[0\]: ValueError: could not convert"),
-        (costs(mine.no_argument), Sensor(), r"association.costs\[0\]: TypeError: no_argument\(\) takes 0"),
-        (replace(settings, edges=(mine.Breaks(), mine.Chain())), Sensor(), r"edges\[0\]: ZeroDivisionError"),
+        (
+            costs(mine.alike, mine.missing_key),
+            Sensor(),
+            r"association.costs\[1\] \(my_parts:missing_key\): KeyError: 'key'",
+        ),
+        (costs(mine.no_numbers), Sensor(), r"association.costs\[0\] \(.*\): ValueError: could not convert"),
+        (costs(mine.no_argument), Sensor(), r"association.costs\[0\] \(.*\): TypeError: no_argument\(\) takes 0"),
+        (
+            replace(settings, edges=(mine.Breaks(), mine.Chain())),
+            Sensor(),
+            r"edges\[0\] \(my_parts:Breaks\): ZeroDivisionError",
+        ),
         (replace(settings, edges=(mine.Idle(),)), Sensor(), "edge rule Idle: expected Pairs .* got NoneType"),
         (settings, mine.BreaksIn(), "BreaksIn.detection_covariance.*: expected a finite number"),
         (settings, mine.Doubtless(), "Doubtless.probability: expected numbers above 0 and below 1"),
     ]:
         with subtests.test(message), pytest.raises(InputError, match=message):
             run(Tracker(found, {"lidar": sensor}))
+    with pytest.raises(InputError, match=r"interaction my_parts:Towless: KeyError: 'hitch'") as raised:
+        TrackerSettings(edges=(Following(interaction=mine.Towless()),))
+    assert isinstance(raised.value.__cause__, KeyError)
     with pytest.raises(InputError, match="motion: expected one that has a hash"):
         ClassSettings(motion=mine.Changing())
     with pytest.raises(InputError, match=r"a.motion: Matrix.A: .* has no YAML form"):

@@ -169,6 +169,11 @@ def _tell(table: RawTable, clock: Clock) -> None:
     for ours, theirs in table.found.names.items():
         if ours != theirs or ours in table.found.units:
             log.info("%s: %s is read from %r, in %s", table.path, ours, theirs, table.found.units.get(ours, "our unit"))
+    length, width = (table.found.names.get(name, "") for name in ("length", "width"))
+    if length.endswith("_x") and width.endswith("_y"):
+        order, other = "is read as length, width, height", {"columns": {"length": width, "width": length}}
+        swapped, size = option_text(other, table.within), length.removesuffix("_x")
+        log.warning("%s: %s %s; where width comes first: %s", table.path, size, order, swapped)
     if clock.guessed:
         long = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}[clock.unit]
         says = option_text({"units": {"time": clock.unit}}, table.within)
@@ -232,7 +237,7 @@ def _read_ndjson(reading: _Reading) -> Iterator[RawTable]:
             names = set().union(*rows)
             if not rows:
                 names = set(layout.columns)
-            if not rows or {canonical(name) for name in names} <= OF_FRAMES:  # every frame is empty
+            if all(isinstance(row, EmptyFrame) for row in rows) or {canonical(name) for name in names} <= OF_FRAMES:
                 names |= {"x", "y"}
             found = reading.understood(names)
             columns: dict[str, Values] = {
@@ -241,8 +246,18 @@ def _read_ndjson(reading: _Reading) -> Iterator[RawTable]:
             yield RawTable(path, columns, len(rows), partial(_line, lines), False, found, reading.hint(names))
 
 
+Nested = dict[tuple[str, ...], Any]
+"""Values of a JSON object by the names on the way to each."""
+
+
+class EmptyFrame(dict[str, Any]):
+    """What a line says of a frame whose list of objects is empty."""
+
+
 def _json_rows(path: Path, file: TextIO) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Line numbers and rows. Lines whose lists are all empty wait for one that tells which list has the objects."""
     names = set[str]()  # of lists of objects
+    waiting: list[tuple[int, Nested, dict[str, list[dict[str, Any]]]]] = []
     for number, line in enumerate(file, start=1):
         if not line.strip():
             continue
@@ -257,16 +272,29 @@ def _json_rows(path: Path, file: TextIO) -> Iterator[tuple[int, dict[str, Any]]]
         if len(filled) > 1:
             raise InputError(f"{path}: line {number}: expected one list of objects, got {', '.join(sorted(filled))}")
         names |= filled.keys()
-        shared = _named(common, of_frame=not names.isdisjoint(lists))
-        for entry in next(iter(filled.values()), [{}]):
+        waiting.append((number, common, lists))
+        if not names and lists:
+            continue
+        yield from ((before, _without_objects(each, names, of)) for before, each, of in waiting[:-1])
+        waiting.clear()
+        if not filled:
+            yield number, _without_objects(common, names, lists)
+        shared = _named(common, of_frame=True)
+        for entry in next(iter(filled.values()), []):
             own, deeper = _flattened((), entry)
             if any(deeper.values()):
                 raise InputError(f"{path}: line {number}: {min(deeper)}: expected no list of objects in an object")
             yield number, {**shared, **_named(own)}
+    found = {(meaning(name) or (name,))[0] for _, common, _ in waiting for name in _named(common)}
+    for number, common, lists in waiting:
+        yield number, _without_objects(common, () if {"x", "y"} <= found else lists, lists)
 
 
-Nested = dict[tuple[str, ...], Any]
-"""Values of a JSON object by the names on the way to each."""
+def _without_objects(common: Nested, names: Collection[str], lists: Collection[str]) -> dict[str, Any]:
+    """The row of a line without objects; of a frame where one of its `lists` has the name of one of objects."""
+    if set(names).isdisjoint(lists):
+        return _named(common)
+    return EmptyFrame(_named(common, of_frame=True))
 
 
 def _flattened(within: tuple[str, ...], values: Mapping[str, Any]) -> tuple[Nested, dict[str, list[dict[str, Any]]]]:

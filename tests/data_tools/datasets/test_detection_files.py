@@ -168,6 +168,23 @@ timestamp,coordinates,x,y,odometry_x,odometry_y,odometry_yaw,odometry_dt,gps_x,g
 """
 
 
+def test_leading_frames_without_objects_say_nothing_of_them(tmp_path, caplog):
+    """A nested place of the vehicle is that of no object, in files of empty frames alone too."""
+    path = tmp_path / "frames.ndjson"
+    empty = '{"t": %d, "objects": [], "position": {"x": 1.0, "y": 2.0}, "drive": {"by": "me"}}\n'
+    full = '{"t": 2, "objects": [{"x": 5, "y": 6, "size": [4, 2, 1.5]}], "position": {"x": 1.0, "y": 2.0}}\n'
+    path.write_text(empty % 0 + empty % 1 + full)
+    scene = read_detections(path).scene("frames")
+    assert [len(frame.detections) for frame in scene.frames] == [0, 0, 1]
+    assert "size is read as length, width, height; where width comes first: --columns" in caplog.text
+    nothing = tmp_path / "nothing.ndjson"
+    nothing.write_text('{"t": 0, "objects": [], "drive": {"by": "me"}}\n')
+    assert [len(frame.detections) for frame in read_detections(nothing).scene("nothing").frames] == [0]
+    flat = tmp_path / "flat.ndjson"
+    flat.write_text('{"t": 0, "position": {"x": 1, "y": 2}, "tags": []}\n')
+    assert read_detections(flat).scene("flat").frames[0].detections.boxes.position[0].tolist() == [1, 2, 0]
+
+
 def test_the_vehicles_own_measurements_come_with_its_frames(tmp_path):
     first, second, third = read_detections(write(tmp_path, ".csv", EGO_CSV)).scene("drive").frames
     assert [frame.world_T_ego for frame in (first, second, third)] == [None] * 3
@@ -220,6 +237,10 @@ BROKEN_CSV = [
     ("timestamp,x,x,y\n0,1,1,4\n", "line 1: expected every column once"),
     (HEAD + "1,2\n", "line 3: expected 7 columns, got 2"),
     (HEAD + "\n1,far,1,1,1,1,car\n", "line 4: x: expected a number, got 'far'"),
+    (
+        HEAD + "\n28.11.2026 14:00:00,1,1,1,1,1,car\n",
+        "line 4: timestamp: expected a number, or a date and time of ISO 8601 (2026-",
+    ),
     (HEAD + "1,nan,1,1,1,1,car\n", "line 3: x: expected a finite number of metres, got nan"),
     (HEAD + "1,1,1e999,1,1,1,car\n", "line 3: y: expected a finite number, got inf"),
     (HEAD + "1,,1,1,1,1,car\n", "line 3: x: expected a finite number of metres, it is left out"),

@@ -63,6 +63,13 @@ def test_usual_names_and_units_at_their_ends_are_understood(tmp_path, suffix):
     assert np.isnan(sign.yaw)
 
 
+def test_a_named_column_that_lacks_is_an_error_also_where_it_is_of_tracks(tmp_path):
+    path = tmp_path / "found.csv"
+    path.write_text("timestamp,x,y\n0,1,2\n")
+    with pytest.raises(InputError, match="--columns id=object_no: there is no column 'object_no'"):
+        read_detections(path, TableImport(columns={"id": "object_no"}))
+
+
 def test_classes_are_renamed_and_left_out_and_their_frames_stay(tmp_path):
     how = TableImport(classes={"REGULAR_VEHICLE": "car", "SIGN": ""})
     for suffix in (".csv", ".parquet"):

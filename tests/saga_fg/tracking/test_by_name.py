@@ -168,7 +168,7 @@ def test_a_users_estimator_tracks_as_the_toolkits_do(mine):
 
 def test_an_estimator_that_raises_is_named_and_a_step_that_fails_changes_nothing(mine, monkeypatch):
     tracker = Tracker(settings("my_estimators:Breaks"))
-    with pytest.raises(InputError, match=r"estimator: my_estimators:Breaks: ZeroDivisionError: no gain"):
+    with pytest.raises(InputError, match=r"estimator \(my_estimators:Breaks\): ZeroDivisionError: no gain"):
         run(tracker, frames(3))
     with pytest.raises(InputError, match=r"unknown estimator '', expected one of: kalman"):
         Tracker(settings(""))

@@ -37,7 +37,9 @@ def motion(dt, density):
 def test_an_object_apart_is_predicted_as_the_textbook_says():
     rows = traffic()
     rows = rows[rows.label == "pedestrian"]
-    settings = TrackerSettings({"default": ClassSettings(ConstantVelocity(0.7), initial_speed_deviation=2.0)})
+    settings = TrackerSettings(
+        {"default": ClassSettings(ConstantVelocity(0.7), initial_speed_deviation=2.0)}, min_hits=2
+    )
     z, H, R = rows[["x", "y"]].to_numpy(), np.eye(2, 4), 0.04 * np.eye(2)
     x = Gaussian(np.array([*z[0], 0, 0]), np.diag([0.04, 0.04, 4.0, 4.0]))
     F, Q = motion(0.1, 0.7)
@@ -105,7 +107,7 @@ def test_times_are_those_of_tracks_whatever_the_offset_of_the_sensor(offset):
 
 
 def test_modes_have_the_mean_and_covariance_of_their_mixture():
-    settings = TrackerSettings(edges=(), stationary_share=0.5)
+    settings = TrackerSettings(edges=(), stationary_share=0.5, min_hits=2)
     rows = pd.DataFrame({"timestamp": np.repeat(np.arange(8) / 5, 2), "x": 0.0, "y": [0.0, 9.0] * 8})
     rows["x"] += np.where(rows.y > 0, 1.2 * rows.timestamp, 0.1 * np.sin(9 * rows.timestamp))
     arguments = {"settings": settings, "sensors": SENSORS}
@@ -121,7 +123,7 @@ def test_modes_have_the_mean_and_covariance_of_their_mixture():
         assert w @ x / w.sum() == pytest.approx(whole.x[key], abs=1e-3 * (1 + np.ptp(x)))
         variance = w @ (of_track.cov_xx.to_numpy() + (x - w @ x) ** 2)
         assert variance == pytest.approx(whole.cov_xx[key], rel=1e-2)
-    without = saga_fg.predict(rows, [1.0], modes=True, settings=TrackerSettings(edges=()))
+    without = saga_fg.predict(rows, [1.0], modes=True, settings=TrackerSettings(edges=(), min_hits=2))
     assert set(without["mode"]) == {"moving"}
     assert (without.probability == 1).all()
 
@@ -162,7 +164,6 @@ def test_what_cannot_be_predicted_is_named(subtests):
         ({"method": "centerpoint"}, "method: expected saga or kf, centerpoint predicts nothing"),
         ({"method": "sage"}, "method: expected one of saga, kf, centerpoint, got 'sage'"),
         ({"like": "thin"}, "like: expected one of plain, dense, got 'thin'"),
-        ({"like": "dense", "settings": PLAIN}, "like: expected None beside settings, got 'dense'"),
     ]:
         with subtests.test(message), pytest.raises(InputError, match=re.escape(message)):
             saga_fg.predict(rows, **arguments)
@@ -177,6 +178,17 @@ def test_what_cannot_be_predicted_is_named(subtests):
         saga_fg.predict(rows, settings={"min_hits": 2})
     with pytest.raises(InputError, match=re.escape("sensors.lidar: expected Sensor, got float")):
         saga_fg.track(rows, sensors={"lidar": 0.2})
+
+
+def test_settings_keep_what_fits_tables_where_they_say_nothing():
+    rows, few = traffic(1.0), TrackerSettings(edges=())
+    with pytest.warns(
+        UserWarning, match="settings: min_hits is at its default, 1, where .* have 2: like='plain' keeps"
+    ):
+        hasty = saga_fg.track(rows, settings=few)
+    kept = saga_fg.track(rows, settings=few, like="plain")
+    pd.testing.assert_frame_equal(kept, saga_fg.track(rows, settings=TrackerSettings(edges=(), min_hits=2)))
+    assert len(hasty) > len(kept)
 
 
 def test_times_from_which_nothing_is_predicted_are_left_out_and_named():
