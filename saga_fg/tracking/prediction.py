@@ -25,12 +25,13 @@ detections (`saga_fg.tracking.track_life`), which soon are the smaller part.
 import logging
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from saga_fg.kernels.paths import mean_courses
-from saga_fg.model import Curvilinear, KnownCourses, NodeTable, Paths, Unseen, build_graph, turning_time
+from saga_fg.model import Curvilinear, Following, KnownCourses, NodeTable, Paths, Unseen, build_graph, turning_time
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, of_classes, unchecked, wrap_angle
 from saga_fg.tracking.edge_record import answers
 from saga_fg.tracking.right_of_way import INTERVAL, PERSON
@@ -38,7 +39,7 @@ from saga_fg.tracking.track_filters import MOVING, TURNING, Kinematics
 from saga_fg.tracking.track_life import reported_rows, untrackable
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.traffic import STEP, paths, straight_paths
-from saga_fg.types import VEHICLES, PredictedMode, PredictedTracks
+from saga_fg.types import VEHICLES, Hypothesis, PredictedMode, PredictedTracks
 
 ACROSS = 0.3  # m/s, deviation of the velocity of a vehicle across its path: it moves within its lane
 LEAVING = 1.0  # m/s, where no earlier traffic tells the path: it may turn, or leave its lane
@@ -265,12 +266,16 @@ def node_table(state: TrackerState, paths: Paths | None = None) -> NodeTable:
     return nodes.append(here.table(len(nodes), state.origin, state.joint)) if len(here) else nodes
 
 
-def look_ahead(state: TrackerState, horizons: FloatArray, joint: bool = False) -> PredictedTracks:
+def look_ahead(
+    state: TrackerState, horizons: FloatArray, joint: bool = False, hypotheses: bool = False
+) -> PredictedTracks:
     """Predict the reported tracks to `horizons` (H,), s; changes the state, which is to be a copy.
 
-    Left out are tracks that can't be predicted to the last of them. joint: with their joint covariances.
+    Left out are tracks that can't be predicted to the last of them. joint: with their joint covariances. hypotheses:
+    where edges answer for themselves, the modes of those that move are to wait, to follow and to go on.
     """
     newest, reported = state.clock.newest, state.table.id[reported_rows(state)]
+    cases = _hypotheses(state) if hypotheses and state.settings.edge_prior < 1 else []
     tables, expected, moving, together = [], [], [], []
     for horizon in horizons.tolist():
         _predict_to(state, state.relative(newest) + horizon)
@@ -279,7 +284,9 @@ def look_ahead(state: TrackerState, horizons: FloatArray, joint: bool = False) -
         expected.append(state.reported_kinematics(rows))
         moving.append(state.kinematics().select(rows))
         together.append(_joint_covariance(state, rows, expected[-1].P) if joint else np.empty((0, 0)))
-    last = tables[-1]
+    ways = [_ways(twin, horizons) for _, _, twin in cases]
+    both = [ids for each in ways for ids, _ in each[-1:]]
+    last = tables[-1].select(np.flatnonzero(np.all([np.isin(tables[-1].id, ids) for ids in (tables[-1].id, *both)], 0)))
     kept = [np.flatnonzero(np.isin(table.id, last.id)) for table in tables]
     yaw = np.stack([table.box.yaw[k] for table, k in zip(tables, kept, strict=True)])
     of_pairs = [(2 * k[:, None] + [0, 1]).ravel() for k in kept]  # the coordinates of the tracks kept
@@ -289,19 +296,50 @@ def look_ahead(state: TrackerState, horizons: FloatArray, joint: bool = False) -
     standing = [Kinematics(one.position, none[0], one.P, none[1]) for one in still]
     stands = np.stack([one.probability for one in still]) * (state.settings.stationary_share > 0)
     moves = [now.select(rows) for now, rows in zip(moving, kept, strict=True)]
+    modes = [PredictedMode("moving", 1 - stands, **_world_columns(state, moves))] if not cases else []
+    for (name, share, twin), way in zip(cases, ways, strict=True):
+        own = [now.select(np.flatnonzero(np.isin(ids, last.id))) for ids, now in way]
+        p = np.array([share[node] for node in last.id.tolist()])
+        modes.append(PredictedMode(name, (1 - stands) * p, **_world_columns(twin, own)))
+    modes.append(PredictedMode("stationary", stands, **_world_columns(state, standing)))
+    mean = _world_columns(state, [now.select(rows) for now, rows in zip(expected, kept, strict=True)])
     return PredictedTracks(
-        newest,
-        horizons,
-        last.id,
-        last.label,
-        yaw=yaw,
-        **_world_columns(state, [now.select(rows) for now, rows in zip(expected, kept, strict=True)]),
-        modes=(
-            PredictedMode("moving", 1 - stands, **_world_columns(state, moves)),
-            PredictedMode("stationary", stands, **_world_columns(state, standing)),
-        ),
-        joint_covariance=whole,
+        newest, horizons, last.id, last.label, yaw=yaw, **mean, modes=tuple(modes), joint_covariance=whole
     )
+
+
+def _hypotheses(state: TrackerState) -> list[tuple[Hypothesis, dict[int, float], TrackerState]]:
+    """What those that move may do, with the probability of each by id, and a state in which all do so."""
+    table = state.table
+    nodes = node_table(state, predicted_paths(state, np.ones(len(table), dtype=np.bool_), LOOKAHEAD_STEP))
+    governing = state.edge_record.governing(state.rules, state.halting, state.settings.edge_prior, state.time)
+    follows, waits = np.zeros(len(nodes)), state.right_of_way.waiting(table.id)
+    leading = [answers(rule) and isinstance(rule, Following) for rule in state.rules]
+    for number, rule in enumerate(state.rules):
+        if leading[number] and governing is not None:
+            target, source, _ = rule.pairs(nodes)
+            np.maximum.at(follows, target, governing(number, nodes, target, source))
+    led = (1 - waits) * follows[: len(table)]
+    shares: dict[Hypothesis, FloatArray] = {"waits": waits, "follows": led, "goes on": 1 - waits - led}
+    found = []
+    for name, share in shares.items():
+        twin = state.copied()
+        twin.right_of_way = state.right_of_way.decided(name == "waits")
+        if name == "follows":
+            twin.settings = replace(state.settings, edge_prior=1.0)
+        elif name == "goes on":
+            twin.rules = tuple(rule for rule, leads in zip(state.rules, leading, strict=True) if not leads)
+        found.append((name, dict(zip(table.id.tolist(), share.tolist(), strict=True)), twin))
+    return found
+
+
+def _ways(state: TrackerState, horizons: FloatArray) -> list[tuple[IntArray, Kinematics]]:
+    """Ids and kinematics of all tracks at each horizon; changes the state."""
+    found = []
+    for horizon in horizons.tolist():
+        _predict_to(state, state.relative(state.clock.newest) + horizon)
+        found.append((state.table.id, state.kinematics()))
+    return found
 
 
 def _world_columns(state: TrackerState, each: Sequence[Kinematics]) -> dict[str, Any]:

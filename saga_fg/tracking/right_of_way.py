@@ -116,6 +116,14 @@ class RightOfWay:
                 found[pair[0]] = p, place
         return found
 
+    def waiting(self, ids: IntArray) -> FloatArray:
+        """Probability (n,) that vehicles wait, by `ids` (n,)."""
+        return np.array([self._waiting[node][0] if node in self._waiting else 0.0 for node in ids.tolist()])
+
+    def decided(self, waits: bool) -> Self:
+        """As if all that may wait did, or nobody."""
+        return replace(self, line={}, halts={node: (1.0, at) for node, (_, at) in self._waiting.items() if waits})
+
     def accelerations(
         self, ids: IntArray, position: FloatArray, heading: FloatArray, speed: FloatArray, free: FloatArray
     ) -> FloatArray:

@@ -178,7 +178,8 @@ def predict(
     horizons    (H,) s, increasing, from 0 to 60
     times       (T,) from which to predict, s as in the table of tracks, in any order; the last frame of each scene if
                 left out. Nothing that comes after a time has an influence on what is predicted from it.
-    modes       a row for each mode (moving, stationary), with `probability`; otherwise their mean and covariance
+    modes       a row for each mode, with `probability`; otherwise mean and covariance. Modes: moving, stationary; with
+                settings for dense traffic waits, follows, goes on
 
     The table is of the same kind, with the columns of `PredictedTracks.table_columns`, and `scene` if the detections
     have one. Warns and raises as `track`. Warns of times that are left out: those in no scene, and those from which a
@@ -200,7 +201,9 @@ def predict(
             while frames and frames[0][0] <= time:
                 newest = tracker.step(frames.popleft()[1]).timestamp
             if within_reach(ahead + (time - newest)):
-                parts.append(found.named(scene.name, tracker.predict(ahead, since=time).table_columns(modes)))
+                parts.append(
+                    found.named(scene.name, tracker.predict(ahead, since=time, hypotheses=modes).table_columns(modes))
+                )
                 left_out.discard(time)
     if left_out:
         within = f"within a scene ({', '.join(spans[:6])}), at most {LONGEST_PREDICTION:g} s from a frame to a horizon"

@@ -259,17 +259,23 @@ class Tracker:
         predict_state(ahead, ahead.relative(min(timestamp, newest + LATEST)))
         return report_tracks(ahead, timestamp)
 
-    def predict(self, horizons: ArrayLike, joint: bool = False, since: float | None = None) -> PredictedTracks:
+    def predict(
+        self, horizons: ArrayLike, joint: bool = False, since: float | None = None, hypotheses: bool = False
+    ) -> PredictedTracks:
         """The tracks reported now at future times, with the edges of the graph that go on to act.
 
-        horizons  (H,) s, increasing, from 0 to 60
-        joint     with the joint covariance of all positions at each of these times
-        since     timestamp from which the horizons count, s; the newest frame's if left out
+        horizons    (H,) s, increasing, from 0 to 60
+        joint       with the joint covariance of all positions at each of these times
+        since       timestamp from which the horizons count, s; the newest frame's if left out
+        hypotheses  where `edge_prior` is below 1: modes for who waits for others, follows, or goes on; takes four times
+                    as long, and there is none with `joint`
 
         Nothing is taken in or changed. Left out are tracks that can't be predicted that far. Raises `InputError` for
         other horizons, also as counted from the newest frame, and before the first frame.
         """
         checked, newest = checked_horizons(horizons), self._state.clock.newest
+        if joint and hypotheses:
+            raise InputError("predict: expected joint or hypotheses, got both")
         if newest == -math.inf:
             raise InputError("predict: expected a frame before, there is no time to predict from")
         since = newest if since is None else finite_seconds(since)
@@ -278,7 +284,7 @@ class Tracker:
             got = f"{since + checked[0]:.10g} to {since + checked[-1]:.10g}"
             within = f"from the newest frame, at {newest:.10g} s, to {LONGEST_PREDICTION:g} s later"
             raise InputError(f"predict: expected times {within}, got {got}")
-        found = look_ahead(self._state.copied(), ahead, joint)
+        found = look_ahead(self._state.copied(), ahead, joint, hypotheses)
         return replace(found, timestamp=since, horizons=checked)
 
     def snapshot(self) -> TrackerSnapshot:

@@ -286,14 +286,18 @@ def _placed(position: FloatArray, velocity: FloatArray, covariance: FloatArray) 
 LONGEST_PREDICTION = 60.0  # s; nobody knows where traffic is a minute later, and time runs out before
 
 
+Hypothesis = Literal["moving", "stationary", "waits", "follows", "goes on"]
+
+
 @dataclass(frozen=True, eq=False)
 class PredictedMode:
-    """How N tracks go on in one of two cases: they move, or stand where they were last.
+    """How N tracks go on in one of some cases: they move, or stand where they were last; those that move may wait for
+    others, follow their leaders, or go on along their paths.
 
     probability  (H, N)  of this case at each horizon; the other columns are as in `PredictedTracks`, given the case
     """
 
-    name: Literal["moving", "stationary"]
+    name: Hypothesis
     probability: FloatArray
     position: FloatArray
     velocity: FloatArray
@@ -317,7 +321,9 @@ class PredictedTracks(ShownTable):
     yaw                  (H, N)        heading, rad; NaN where it is unknown
     position_covariance  (H, N, 2, 2)  m^2
     velocity_covariance  (H, N, 2, 2)  (m/s)^2
-    modes                              moving and stationary, of which mean and covariance are the mixture's
+    modes                              moving and stationary, of which mean and covariance are the mixture's; if
+                                       hypotheses were asked for, waits, follows and goes on stand for moving, beside
+                                       the same mean and covariance
     joint_covariance     (H, 2N, 2N)   of all positions (x_1, y_1, x_2, ...), m^2; None unless it was asked for
     """
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from saga_fg import Boxes, Detections, Frame, Tracker, TrackerSettings
+from saga_fg.errors import InputError
 from saga_fg.kernels.paths import path_meetings
 from saga_fg.model import NodeTable, Paths
 from saga_fg.tracking.edge_record import Lines
@@ -318,6 +319,27 @@ def test_a_stop_line_without_light_across_no_lane_is_named_and_left_out(caplog):
     _, tracker = alone_until_hidden(road, 3)
     assert caplog.messages == ["stop line stop: no lane of the map crosses it; vehicles are not expected to halt there"]
     assert len(tracker.snapshot().halting.lines) == 0
+
+
+def test_modes_tell_who_waits_follows_or_goes_on_beside_the_same_mean():
+    tracker = Tracker(dense_traffic_settings())
+    for k in range(1, 196):
+        cars = cars_at(0.1 * k, True)
+        heading, n = [NORTH if x == 0.0 else EAST for x, _ in cars], len(cars)
+        boxes = Boxes.of(["car"] * n, [(*car, 0.8) for car in cars], [[4.5, 1.8, 1.6]] * n, heading)
+        tracks = tracker.step(Frame(0.1 * k, "lidar", Detections(boxes, np.full(n, 0.9))))
+    plain, told = tracker.predict([1.0, 2.0]), tracker.predict([1.0, 2.0], hypotheses=True)
+    assert [mode.name for mode in told.modes] == ["waits", "follows", "goes on", "stationary"]
+    assert sum(mode.probability for mode in told.modes) == pytest.approx(np.ones((2, len(told))))
+    assert np.array_equal(told.position, plain.position)
+    assert np.array_equal(told.position_covariance, plain.position_covariance)
+    south = np.argmin(np.abs(tracks.boxes.position[:, 0]))
+    row = told.id.tolist().index(tracks.id[south])
+    waits, _, goes, _ = told.modes
+    assert waits.probability[0, row] > 0.3
+    assert waits.position[1, row, 1] < goes.position[1, row, 1] - 1.0
+    with pytest.raises(InputError, match="joint or hypotheses"):
+        tracker.predict([1.0], joint=True, hypotheses=True)
 
 
 def test_who_yields_goes_with_the_tracks_and_through_a_snapshot():
