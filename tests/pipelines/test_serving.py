@@ -27,9 +27,9 @@ from saga_fg.tracking import Tracker
 SETTINGS = StreamSettings()
 
 
-def stream(**settings: Any) -> StreamTracker[str]:
+def stream(method: Any = "saga", horizons: Any = None, **settings: Any) -> StreamTracker[str]:
     config = load_config("file")
-    return StreamTracker(lambda: config.new_tracker("saga"), StreamSettings(**settings))
+    return StreamTracker(lambda: config.new_tracker(method), StreamSettings(**settings), horizons=horizons)
 
 
 def frame(timestamp: float, seq: int | None = None, sensor: str = "lidar", x: float | None = None) -> bytes:
@@ -262,17 +262,12 @@ def test_addresses():
 # Predictions of a stream: with every frame, and on request
 
 
-def predictions_stream(method: Any = "saga", horizons: Any = None, **settings: Any) -> StreamTracker[str]:
-    config = load_config("file")
-    return StreamTracker(lambda: config.new_tracker(method), StreamSettings(**settings), horizons=horizons)
-
-
 def predict(horizons: Any) -> bytes:
     return encode({"type": "predict", "horizons": horizons})
 
 
 def test_a_request_is_answered_with_the_trackers_predictions():
-    service = predictions_stream()
+    service = stream()
     answers(service, *(frame(0.1 * k) for k in range(10)))
     (answer,) = answers(service, predict([0.5, 2]))
     assert answer["type"] == "predictions"
@@ -291,12 +286,12 @@ def test_a_request_is_answered_with_the_trackers_predictions():
 
 
 def test_predictions_come_with_frames_or_requests_that_change_nothing():
-    plain, asked = predictions_stream(), predictions_stream()
+    plain, asked = stream(), stream()
     expected = answers(plain, *(frame(0.1 * k) for k in range(6)))
     found = answers(asked, *(line for k in range(6) for line in (frame(0.1 * k), predict([3]))))
     assert found[::2] == expected
     horizons = np.array([1.0, 3.0])
-    for answer in answers(predictions_stream(horizons=horizons), *(frame(0.1 * k) for k in range(3))):
+    for answer in answers(stream(horizons=horizons), *(frame(0.1 * k) for k in range(3))):
         assert answer["type"] == "tracks"
         predicted = answer["predictions"]
         assert predicted["timestamp"] == answer["timestamp"]
@@ -315,15 +310,15 @@ BAD_HORIZONS = [
 
 
 def test_what_cannot_be_predicted_is_refused():
-    service = predictions_stream()
+    service = stream()
     answers(service, frame(0.0))
     for horizons, why in BAD_HORIZONS:
         (answer,) = answers(service, predict(horizons))
         assert answer["type"] == "error"
         assert why in answer["message"]
-    (early,) = answers(predictions_stream(), predict([1]))
+    (early,) = answers(stream(), predict([1]))
     assert "expected a frame before" in early["message"]
-    (never,) = answers(predictions_stream("centerpoint"), predict([1]))
+    (never,) = answers(stream("centerpoint"), predict([1]))
     assert "expected --method saga or kf" in never["message"]
 
 

@@ -147,16 +147,14 @@ def test_what_is_wrong_in_a_folder_is_one_line(
         (tmp_path / "empty" / "a.bag").write_bytes(b"#ROSBAG V2.0\n")
         with pytest.raises(InputError, match=r"convert that of ROS 1 first: rosbags-convert"):
             open_recording(tmp_path / "empty")
-    with subtests.test("time backwards"):
-        folder = folder_of(tmp_path / "backwards", scans)
-        (folder / "times.txt").write_text("0.0\n0.2\n0.1\n")
-        with pytest.raises(InputError, match=r"times\.txt: line 3: time: expected one after 0\.200000 s, .* got 0\.1"):
-            open_recording(folder)
-        (folder / "times.txt").write_text("0.0\n0.2\n")
-        with pytest.raises(InputError, match=r"times\.txt: expected 3 times, one for each scan, got 2"):
-            open_recording(folder)
-        (folder / "times.txt").write_text("0.0\nsoon\n0.2\n")
-        with pytest.raises(InputError, match=r"times\.txt: line 2: expected a time, got 'soon'"):
+    folder = folder_of(tmp_path / "times", scans)
+    for times, message in [
+        ("0.0\n0.2\n0.1\n", r"times\.txt: line 3: time: expected one after 0\.200000 s, .* got 0\.1"),
+        ("0.0\n0.2\n", r"times\.txt: expected 3 times, one for each scan, got 2"),
+        ("0.0\nsoon\n0.2\n", r"times\.txt: line 2: expected a time, got 'soon'"),
+    ]:
+        (folder / "times.txt").write_text(times)
+        with subtests.test(message), pytest.raises(InputError, match=message):
             open_recording(folder)
     with subtests.test("formats mixed"):
         folder = folder_of(tmp_path / "mixed", scans)
