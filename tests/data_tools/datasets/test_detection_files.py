@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import data_tools.datasets.detection_files
@@ -96,6 +96,7 @@ sizes = st.none() | st.floats(1e-3, 1e3)
 rows = st.tuples(st.integers(0, 5), st.sampled_from("ab"), st.none() | st.tuples(numbers, numbers, sizes))
 
 
+@settings(max_examples=40)
 @given(st.lists(rows, min_size=1, max_size=12))
 def test_csv_and_ndjson_agree(tmp_path_factory, table):
     folder = tmp_path_factory.mktemp("agree")

@@ -15,7 +15,7 @@ from data_tools.datasets.kitti import (
 )
 from data_tools.datasets.kitti.source import TRACK_TABLE
 from data_tools.metrics.kitti_boxes import has_box
-from saga_fg import Boxes, InputError, Scene, Tracks
+from saga_fg import Boxes, InputError, Tracks
 from tests.data_tools.kitti_example import write_sequence
 
 
@@ -28,11 +28,6 @@ def tracks(boxes: Boxes, score: float = 0.5) -> Tracks:
     n = len(boxes)
     none = np.zeros((n, 2, 2))
     return Tracks(0.0, np.arange(n) + 3, boxes, np.full(n, score), none, none, np.zeros(n))
-
-
-def truth_as_tracks(scene: Scene) -> list[Tracks]:
-    assert scene.ground_truth is not None
-    return [tracks(moment.boxes) for moment in scene.ground_truth]
 
 
 def car(position: tuple[float, float, float], label: str = "car", yaw: float = 0.0, height: float = 1.5) -> Tracks:
@@ -66,19 +61,6 @@ def test_the_table_beside_the_results_has_all_tracks_in_world_coordinates(data, 
     np.testing.assert_array_equal(rows.position_covariance, np.zeros((2, 2, 2)))
 
 
-def test_labels_to_the_world_and_back(data, tmp_path):
-    scene = data.scene("0007")
-    write_kitti_results(tmp_path / "out", data, [(scene, truth_as_tracks(scene))])
-    written = read_kitti_labels(tmp_path / "out" / "0007.txt")
-    labels = read_kitti_labels(tmp_path / "kitti" / "training" / "label_02" / "0007.txt")
-    labels = labels.select(labels.track_id >= 0)
-    assert written.frame.tolist() == labels.frame.tolist()
-    assert written.type.tolist() == labels.type.tolist()
-    np.testing.assert_allclose(written.boxes.size, labels.boxes.size, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(written.boxes.location, labels.boxes.location, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(written.boxes.rotation_y, labels.boxes.rotation_y, rtol=0, atol=1e-6)
-
-
 def test_what_shows_is_written_and_a_sequence_without_tracks_is_an_empty_file(data, tmp_path):
     moments = [car((-20, 2, 1)), car((11, 60, 1)), car((11, 2, 1))]  # behind, far to the left, ahead
     write_kitti_results(tmp_path / "out", data, [(data.scene("0007"), moments)])
@@ -106,18 +88,6 @@ def test_tracks_that_cannot_be_written(data, tmp_path, subtests):
 @pytest.fixture(scope="module")
 def kitti(recordings: Path) -> KittiTracking:
     return KittiTracking(recordings / "kitti", recordings / "kitti" / "detections" / "pointrcnn", ground_truth=True)
-
-
-def lines(path: Path) -> int:
-    return len(path.read_text().splitlines())
-
-
-def test_every_record_is_read(kitti, recordings):
-    for name in kitti.scenes:
-        scene = kitti.scene(name)
-        assert len(scene) == len(scene.frames) == lines(recordings / "kitti" / "training" / "oxts" / f"{name}.txt")
-        found = (recordings / "kitti" / "detections" / "pointrcnn").glob(f"*/{name}.txt")
-        assert sum(map(len, scene.frames)) == sum(map(lines, found))
 
 
 def test_projection_agrees_with_the_labelled_image_boxes(kitti, recordings):

@@ -304,15 +304,6 @@ def test_a_bag_is_not_written_to(tmp_path):
     assert {each.name for each in path.iterdir()} == {file.name, "metadata.yaml"}
 
 
-def test_chunks_that_are_damaged_are_one_line(tmp_path):
-    path = example.write_mcap(tmp_path / "drive.mcap", example.drive())
-    content = bytearray(path.read_bytes())
-    content[200:264] = b"\xff" * 64
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=r"^[^\n]*drive\.mcap: [^\n]*$"):
-        read(path)
-
-
 def test_definitions_hold_all_that_they_are_made_of():
     text = definition("autoware_auto_perception_msgs/msg/TrackedObjects")
     assert text == definition(plain_type("autoware_perception_msgs/TrackedObjects"))

@@ -159,12 +159,6 @@ def test_writing_is_all_or_nothing(tmp_path):
     assert len(read.scene("scene-0001")) == 2  # without a sensor named lidar the poses are there all the same
 
 
-def test_what_cannot_be_written_is_refused(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="expected the name of a folder"):
-        write(tmp_path / "file", SimulatedTraffic(SHORT, scenes=1))
-
-
 def test_classes_beyond_vehicles_and_pedestrians_have_their_categories(tmp_path):
     traffic = TrafficSettings(truck_share=0.7, bus_share=0.0, trailer_share=1.0)
     settings = SimulatorSettings(duration=2.0, warm_up=5.0, traffic=traffic)

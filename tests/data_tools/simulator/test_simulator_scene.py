@@ -262,13 +262,14 @@ def test_objects_are_remembered_for_a_while_and_glimpses_are_no_sightings():
 
 
 def test_the_dataset_makes_its_scenes_on_demand():
-    dataset: Dataset = SimulatedTraffic(SHORT, scenes=3, seed=1)
+    tiny = replace(SHORT, duration=1.0, warm_up=1.0)
+    dataset: Dataset = SimulatedTraffic(tiny, scenes=3, seed=1)
     assert dataset.scenes == ("scene-0001", "scene-0002", "scene-0003")
     first = dataset.scene("scene-0002")
     assert first.name == "scene-0002"
-    larger = SimulatedTraffic(SHORT, scenes=5, seed=1)
+    larger = SimulatedTraffic(tiny, scenes=5, seed=1)
     assert np.array_equal(larger.scene("scene-0002").world_T_ego, first.world_T_ego)
-    other = SimulatedTraffic(SHORT, scenes=3, seed=2)
+    other = SimulatedTraffic(tiny, scenes=3, seed=2)
     assert not np.array_equal(other.scene("scene-0002").world_T_ego, first.world_T_ego)
 
 

@@ -25,6 +25,7 @@ from saga_fg.types.boxes import Boxes
 from saga_fg.types.frame import Detections
 
 POSE = yaw_transform(800.0, 400.0, 0.0, 2.0)
+COUNT = 1200  # frames
 CENTRED = replace(lidar(), position=(0.0, 0.0, 1.8))
 
 
@@ -54,23 +55,23 @@ def test_errors_along_and_across_the_line_of_sight(sensor, distance):
     place = distance * np.array([[np.cos(bearing), np.sin(bearing)]])
     truth = cars(place)
     found = Detections(
-        Boxes.concatenate([d.boxes for d in detections(sensor, truth, frames=3000)]), np.full(3000, 0.5)
+        Boxes.concatenate([d.boxes for d in detections(sensor, truth, frames=COUNT)]), np.full(COUNT, 0.5)
     ).boxes
     error = found.position - truth.position
     u = np.array([np.cos(bearing + 2.0), np.sin(bearing + 2.0)])
     along, across = error[:, :2] @ u, error[:, :2] @ np.array([-u[1], u[0]])
     for sample, (base, slope) in ((along, sensor.range_noise), (across, sensor.bearing_noise)):
         sigma = base + slope * distance
-        assert within(sample.mean(), 0.0, sigma / math.sqrt(3000))
-        assert within(sample.std(), sigma, sigma / math.sqrt(6000))
-    assert within(error[:, 2].std(), sensor.height_noise, sensor.height_noise / math.sqrt(6000))
-    assert within((found.yaw - truth.yaw).std(), sensor.yaw_noise, sensor.yaw_noise / math.sqrt(6000))
-    assert within(np.log(found.size / truth.size).std(), sensor.size_noise, sensor.size_noise / math.sqrt(18000))
+        assert within(sample.mean(), 0.0, sigma / math.sqrt(COUNT))
+        assert within(sample.std(), sigma, sigma / math.sqrt(2 * COUNT))
+    assert within(error[:, 2].std(), sensor.height_noise, sensor.height_noise / math.sqrt(2 * COUNT))
+    assert within((found.yaw - truth.yaw).std(), sensor.yaw_noise, sensor.yaw_noise / math.sqrt(2 * COUNT))
+    assert within(np.log(found.size / truth.size).std(), sensor.size_noise, sensor.size_noise / math.sqrt(6 * COUNT))
     if sensor.velocity_noise is None:
         assert np.isnan(found.velocity).all()
     else:
         velocity_error = found.velocity - truth.velocity
-        assert within(velocity_error.std(), sensor.velocity_noise, sensor.velocity_noise / math.sqrt(12000))
+        assert within(velocity_error.std(), sensor.velocity_noise, sensor.velocity_noise / math.sqrt(4 * COUNT))
 
 
 @pytest.mark.parametrize(("share", "distance"), [(0.25, 10.0), (0.1, 10.0), (1.0, 59.0)])
@@ -88,10 +89,10 @@ def test_the_rate_of_misses(share, distance):
 
 def test_the_rate_of_clutter_and_where_it_falls():
     sensor = replace(camera(), position=(0.0, 0.0, 1.5), clutter_rate=2.5)
-    found = detections(sensor, Boxes.empty(), frames=4000)
+    found = detections(sensor, Boxes.empty(), frames=COUNT)
     counts = np.array([len(d) for d in found])
-    assert within(counts.mean(), 2.5, math.sqrt(2.5 / 4000))
-    assert within(counts.var(), 2.5, 2.5 * math.sqrt(2.4 / 4000))  # Poisson: variance of the sample variance
+    assert within(counts.mean(), 2.5, math.sqrt(2.5 / COUNT))
+    assert within(counts.var(), 2.5, 2.5 * math.sqrt(2.4 / COUNT))  # Poisson: variance of the sample variance
     everything = Boxes.concatenate([d.boxes for d in found])
     assert in_view(sensor, POSE, everything.position).all()
     distance = np.linalg.norm(everything.position[:, :2] - POSE[:2, 3], axis=1)
@@ -128,10 +129,10 @@ def test_a_radar_measures_the_velocity_along_its_line_of_sight_and_no_boxes():
     bearing, noise = 0.5, sensor.range_rate_noise
     assert noise is not None
     truth = cars(30.0 * np.array([[np.cos(bearing), np.sin(bearing)]]))
-    found = detections(sensor, truth, frames=3000)
+    found = detections(sensor, truth, frames=COUNT)
     error = np.concatenate([d.range_rate for d in found]) - 5.0 * math.cos(bearing)
-    assert within(error.mean(), 0.0, noise / math.sqrt(3000))
-    assert within(error.std(), noise, noise / math.sqrt(6000))
+    assert within(error.mean(), 0.0, noise / math.sqrt(COUNT))
+    assert within(error.std(), noise, noise / math.sqrt(2 * COUNT))
     assert all(np.isnan(d.boxes.size).all() and np.isnan(d.boxes.yaw).all() for d in found)
     false = detections(replace(sensor, clutter_rate=5.0), Boxes.empty())
     assert np.abs(np.concatenate([d.range_rate for d in false])).max() < 6 * noise
