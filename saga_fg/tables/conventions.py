@@ -31,6 +31,7 @@ MAX_FRAMES = 200
 MIN_STEP = 1e-6  # s between two frames, of which a velocity can be told
 SPAN = 0.5  # s of motion, so that the noise of places hardly matters
 _MOVES, _WALKS = 2.0, 0.8  # m/s, from which the direction of motion tells the heading, of vehicles and of people
+_NEARLY = "nearly "  # before a unit that explains headings better, which are not far off as they are
 _ASTRAY, _OFF = 0.5, 0.2  # rad between them: of one object, and of half of them
 _AWAY = 100.0  # m from the origin, from which what surrounds the vehicle does not surround the origin
 _DEEP, _FLAT, _NEAR = 8.0, 3.0, 40.0  # m: spread of depths, spread of heights, and the nearest depth before a camera
@@ -203,7 +204,8 @@ def fitting_convention(
     """The unit of headings (n,), read as rad, of objects that move with `velocity` (n, 2), and how far they are off.
 
     The unit is "rad" where they fit as they are read, "world" where they fit less the heading `axes` (n,) of the frame
-    that they are given in, and "" where no convention fits; None where nothing is told, as where too few move.
+    that they are given in, "" where no convention fits, and begins with `_NEARLY` where another one fits a little
+    better; None where nothing is told, as where too few move.
     """
     moves = (np.hypot(*velocity.T) > np.where(walks, _WALKS, _MOVES)) & np.isfinite(yaw)
     if moves.sum() < 2 * FEWEST:
@@ -225,6 +227,8 @@ def fitting_convention(
     better &= now > 0.5 or turned > 0.1  # some that are turned round are no convention
     if better and astray < 0.2 and off < _OFF:
         return best, said
+    if best in _CONVENTIONS and usual > max(2 * off, 0.08):  # as of mirrored headings nearly along an axis
+        return f"{_NEARLY}{best}", said
     constant = np.ptp(given) < 1e-6
     if now > 0.5 and (constant or not walks[moves].any()):
         return "", said
@@ -241,7 +245,7 @@ def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | Non
     none = np.zeros(len(sample.time), dtype=np.bool_)
     of_ego = fitting_convention(sample.ego_yaw, sample.ego_motion, none)
     units = {name: found[0] for name, found in (("yaw", of_objects), ("ego_yaw", of_ego)) if found is not None}
-    wrong = {name: unit for name, unit in units.items() if unit not in ("rad", "world", "")}
+    wrong = {name: unit for name, unit in units.items() if unit in _CONVENTIONS}
     if "ego_yaw" in wrong and (sample.coordinates == "ego").any():
         wrong.pop("yaw", None)  # how objects move is not known before
     alike = len(wrong) == 2 and len(set(wrong.values())) == 1
@@ -254,6 +258,9 @@ def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | Non
         return Finding(
             "headings", f"{whose} {looks}: {said}", "expected counter-clockwise from x, rad", Mend(units=wrong)
         )
+    if (unit := units.get("yaw", "rad")).startswith(_NEARLY):
+        what = f"headings may be {_CONVENTIONS[unit.removeprefix(_NEARLY)][0]}, or all turned: {said}"
+        return Finding("headings", what, "expected counter-clockwise from x, rad")
     if units.get("yaw") in ("world", ""):
         look = "look like those in the world, beside positions of the vehicle's frame"
         what = f"headings {look if units['yaw'] else 'fit no convention'}: {said}"

@@ -29,6 +29,16 @@ def read(made, how=None):
     return scene
 
 
+@pytest.mark.parametrize(("seed", "kind"), [(4711, "parked street"), (51907, "motorway")])
+def test_mirrored_headings_nearly_along_an_axis_are_told_and_stop_nothing(seed, kind):
+    rng = np.random.default_rng([seed, 0, *map(ord, kind + "mirrored headings")])
+    made = table(kind, rng, True)
+    assert not read(made).findings
+    (told,) = read(TRAPS["mirrored headings"](made)).findings
+    assert told.what.startswith("table: headings may be clockwise, or all turned: ")
+    assert not told.stops
+
+
 @pytest.mark.parametrize("kind", ["queue", "crossing", "parked street"])
 def test_headings_of_the_world_beside_positions_of_the_vehicles_frame_are_named(kind):
     world = table(kind, np.random.default_rng([88111, *map(ord, kind)]), False)
