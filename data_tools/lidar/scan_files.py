@@ -392,7 +392,7 @@ def _arrays(path: Path) -> Columns:
     return columns
 
 
-_LAS_HEADER, _MIN_SIZE_LAS, _LAS_RECORD = 247, 227, 54  # bytes: checked of a header, of the shortest one, of a record
+_LAS_HEADER, _MIN_LAS_HEADER, _LAS_RECORD = 247, 227, 54  # bytes: checked of a header, of the shortest one, of a record
 
 
 def _las(path: Path) -> Columns:
@@ -402,7 +402,7 @@ def _las(path: Path) -> Columns:
         header, size = file.read(_LAS_HEADER).ljust(_LAS_HEADER, b"\0"), file.seek(0, SEEK_END)
     start, records = struct.unpack_from("<II", header, 96)
     extended = struct.unpack_from("<I", header, 243)[0] if header[25] >= 4 else 0
-    if header[:4] != b"LASF" or not _MIN_SIZE_LAS <= start <= size or _LAS_RECORD * (records + extended) > size:
+    if header[:4] != b"LASF" or not _MIN_LAS_HEADER <= start <= size or _LAS_RECORD * (records + extended) > size:
         raise InputError(f"expected a header of LAS, with its records in the {size} bytes of the file")
     return dict(isolated("expected a file that laspy can read", _las_columns, path))
 

@@ -223,7 +223,7 @@ class Localiser:
         self._fits = set[int]()  # keyframes registered with the map
         self._unproved = list[int]()  # keyframes since the structure was compared
         self._clouds: list[tuple[int, FloatArray]] = []  # of the last keyframes, thinned, with their rows
-        self._searched, self._proved = 0.0, 0.0  # m, distance at the last search, and of the last comparison
+        self._searched, self._proved = 0.0, 0.0  # m, distance travelled at the last search, and at the last comparison
         self._smoother: IncrementalSmoother | None = None
         self._last, self._fitted = 0, 0.0  # keyframe in the graph; distance at the last fit, m
         self._pose, self._covariance = np.eye(4), _GUESSED  # of that keyframe
@@ -273,7 +273,7 @@ class Localiser:
 
     @property
     def travelled(self) -> float:
-        """Way by odometry, m."""
+        """Distance by odometry, m."""
         return self._path.travelled[-1] if len(self._path) else 0.0
 
     @property

@@ -190,7 +190,7 @@ class LoopSearch(ABC):
         """
 
     def driven(self, submap: Submap) -> float:
-        """Way until the end of a submap, m, with which drift grows."""
+        """Distance travelled until the end of a submap, m, with which drift grows."""
         return submap.travelled[1]
 
     def add(self, submap: Submap, world_T_submap: FloatArray) -> Sequence[LoopClosure]:
@@ -219,7 +219,7 @@ class LoopSearch(ABC):
         return [replace(loop, confirmed=True) for loop in agreed]
 
     def _distances(self, number: int) -> FloatArray:
-        """Way from each submap so far to this one, along measurements, m."""
+        """Distance from each submap so far to this one, along measurements, m."""
         if not self._edges:
             return np.zeros(len(self._submaps))
         first, second, length = (np.array(column) for column in zip(*self._edges, strict=True))
@@ -316,11 +316,8 @@ class Submaps:
         self.closed, self.loops = list[Submap](), list[LoopClosure]()  # loops are between keyframes
         self._spacing, self._search = spacing, search
         self._clouds: list[npt.NDArray[np.float32]] = []  # of the running submap's keyframes
-        self._travelled, self._begin, self._anchor_T_submap = (
-            0.0,
-            0.0,
-            np.eye(4),
-        )  # m; travelled when it began; its frame
+        self._travelled, self._begin = 0.0, 0.0  # m, now and when the running submap began
+        self._anchor_T_submap = np.eye(4)  # its frame
 
     def add(self, points: FloatArray, world_T_sensor: FloatArray, driven: float) -> None:
         """Add the points (N, 3) of the next keyframe; driven: m since the last."""

@@ -47,7 +47,7 @@ Product = Callable[[FloatArray], FloatArray]
 _ACCEPTED, _POOR, _GOOD = 0.05, 0.25, 0.9  # shares of the promised decrease: to take a step, to shrink, to grow
 _STEP_ROUNDING = 1e-13  # of the cost: differences below are noise
 _MIN_DECREASE = 1e-11  # of the cost: a step that promises less, and does not hold it, meets rounding
-_MIN_DECREASE_RADIUS = 1e-12
+_MIN_RADIUS = 1e-12  # of steps: below, none decreases the cost
 _MOST_STEPS, _MOST_INNER = 200, 300
 
 
@@ -122,7 +122,7 @@ def best_frames(
     radius = np.sqrt(Y.shape[0] * Y.shape[1]) / 8
     products = 0
     for _ in range(_MOST_STEPS):
-        if here.slope <= tolerance * here.cost or radius < _MIN_DECREASE_RADIUS or products >= most_products:
+        if here.slope <= tolerance * here.cost or radius < _MIN_RADIUS or products >= most_products:
             break
         step, promised, at_bound, count = _truncated_cg(here, radius, min(_MOST_INNER, most_products - products))
         products += count + 1

@@ -174,7 +174,7 @@ class SubmapSettings(Settings):
 
 _SOLVER = SolverSettings(tolerance=1e-4, max_iterations=30)
 _AFTER_LOOPS = RelinearisationSettings(0.01)  # deviations are those before the loop, which makes them smaller
-MAX_KEYFRAMES = 80  # keyframes after which the next submap begins, on a shorter distance
+MAX_KEYFRAMES = 80  # keyframes after which the next submap begins, however short the distance
 
 
 @dataclass(frozen=True, eq=False)
