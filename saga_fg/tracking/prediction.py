@@ -216,9 +216,8 @@ def judge_edges(state: TrackerState) -> None:
         unmoved = np.flatnonzero(able & ~table.has_moved)
         place = nodes.position[unmoved] + state.origin
         able[unmoved] = ~state.traffic.passes_beside(table.box.yaw[unmoved], place)  # else it is parked
-        ways = [predicted_paths(state, able, INTERVAL), _walked_paths(state, nodes)]
-        paths = Paths.concatenate(ways)
-        paths = paths.select(np.argsort(paths.row))
+        found = Paths.concatenate([predicted_paths(state, able, INTERVAL), _walked_paths(state, nodes)])
+        paths = found.select(np.argsort(found.row))
         state.right_of_way = state.right_of_way.later(nodes, paths, state.halting.lines, time)
 
 
@@ -284,9 +283,10 @@ def look_ahead(
         expected.append(state.reported_kinematics(rows))
         moving.append(state.kinematics().select(rows))
         together.append(_joint_covariance(state, rows, expected[-1].P) if joint else np.empty((0, 0)))
-    ways = [_ways(twin, horizons) for _, _, twin in cases]
-    both = [ids for each in ways for ids, _ in each[-1:]]
-    last = tables[-1].select(np.flatnonzero(np.all([np.isin(tables[-1].id, ids) for ids in (tables[-1].id, *both)], 0)))
+    in_cases = [_kinematics_at(twin, horizons) for _, _, twin in cases]
+    last = tables[-1]
+    for each in in_cases:  # left out are tracks that can't be predicted in one of them
+        last = last.select(np.flatnonzero(np.isin(last.id, each[-1][0])))
     kept = [np.flatnonzero(np.isin(table.id, last.id)) for table in tables]
     yaw = np.stack([table.box.yaw[k] for table, k in zip(tables, kept, strict=True)])
     of_pairs = [(2 * k[:, None] + [0, 1]).ravel() for k in kept]  # the coordinates of the tracks kept
@@ -297,8 +297,8 @@ def look_ahead(
     stands = np.stack([one.probability for one in still]) * (state.settings.stationary_share > 0)
     moves = [now.select(rows) for now, rows in zip(moving, kept, strict=True)]
     modes = [PredictedMode("moving", 1 - stands, **_world_columns(state, moves))] if not cases else []
-    for (name, share, twin), way in zip(cases, ways, strict=True):
-        own = [now.select(np.flatnonzero(np.isin(ids, last.id))) for ids, now in way]
+    for (name, share, twin), each in zip(cases, in_cases, strict=True):
+        own = [now.select(np.flatnonzero(np.isin(ids, last.id))) for ids, now in each]
         p = np.array([share[node] for node in last.id.tolist()])
         modes.append(PredictedMode(name, (1 - stands) * p, **_world_columns(twin, own)))
     modes.append(PredictedMode("stationary", stands, **_world_columns(state, standing)))
@@ -333,7 +333,7 @@ def _hypotheses(state: TrackerState) -> list[tuple[Hypothesis, dict[int, float],
     return found
 
 
-def _ways(state: TrackerState, horizons: FloatArray) -> list[tuple[IntArray, Kinematics]]:
+def _kinematics_at(state: TrackerState, horizons: FloatArray) -> list[tuple[IntArray, Kinematics]]:
     """Ids and kinematics of all tracks at each horizon; changes the state."""
     found = []
     for horizon in horizons.tolist():
