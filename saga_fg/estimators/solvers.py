@@ -169,12 +169,6 @@ class BatchSolver:
         """Ask some more providers at the present epoch."""
         self._ask(None, providers)
 
-    def marginalise(self, keys: Iterable[int]) -> None:
-        """Integrate variables out, linearised at the solution; their information on others stays."""
-        graph = self.graph().copy()
-        graph.marginalise(keys)
-        self._replace_graph(graph)
-
     def solve(self) -> GraphSolution:
         """Minimise, unless nothing has changed; raises `UndeterminedError` naming the variables that are not."""
         if self._solution is None:
