@@ -163,9 +163,6 @@ class Pairs(NamedTuple):
     rate: FloatArray
 
 
-NO_PAIRS = Pairs(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty(0))
-
-
 @part_kind("edge rule", "saga_fg.edge_rules")
 class EdgeRule(Protocol):
     """Chooses edges from the estimates at the start of an interval.
