@@ -27,7 +27,6 @@ import gtsam
 import numpy as np
 
 from data_tools.datasets.mcap.ros2_types import definition, header
-from data_tools.files import write_text
 from data_tools.laser import LaserLog
 from data_tools.lidar import Scan, ScanSequence, constant_velocity
 from pipelines.slam.odometry import OdometrySettings, OdometryStep, moved_on
@@ -301,7 +300,6 @@ def write_recording(scans: ScanSequence, folder: Path, mcap: Path | None = None,
 _OUTER, _WIDTH = (30.0, 20.0), 3.0  # m: the building, its corridor
 _PERIOD = 0.2  # s between scans
 _BIAS, _SPREAD = 0.006, 0.01  # rad per m that the wheels turn too far, and rad per root metre at random
-_NO_RETURN = 81.91  # m, what the laser says where it hits nothing
 
 
 @dataclass(frozen=True)
@@ -346,16 +344,6 @@ def laser_drive(seed: int, rounds: float = 1.5, kind: LaserKind | None = None) -
     time = np.asarray(_PERIOD * np.arange(n), dtype=np.float64)
     log = LaserLog(time, ranges, np.tile(angles, (n, 1)), odometry, np.zeros(3))
     return log, np.linalg.inv(true[0]) @ true
-
-
-def write_carmen(path: str | Path, log: LaserLog) -> None:
-    """Write a log as FLASER records."""
-    lines = ["# message formats defined: PARAM SYNC ODOM FLASER"]
-    for time, ranges, pose in zip(log.time, np.nan_to_num(log.ranges, nan=_NO_RETURN), log.odometry, strict=True):
-        at = " ".join(f"{value:.6f}" for value in pose)
-        readings = " ".join(f"{r:.3f}" for r in ranges)
-        lines.append(f"FLASER {len(ranges)} {readings} {at} {at} {time:.6f} nohost {time:.6f}")
-    write_text(path, "\n".join(lines) + "\n")
 
 
 def _walls(rng: np.random.Generator) -> FloatArray:

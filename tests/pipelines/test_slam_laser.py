@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.scans import LaserKind, laser_drive, write_carmen
+from benchmarks.scans import LaserKind, laser_drive
 from data_tools.laser import LaserLog, read_carmen
 from data_tools.trajectories import read_tum_poses
 from pipelines.slam.laser_slam import LaserSettings, LaserSlam, laser_slam
 from saga_fg import InputError
 from saga_fg.numerics import transform, transforms, vectors
+from tests.data_tools.carmen_example import NO_RETURN, write_carmen
 from tests.pipelines.command import done, refused
 
 
@@ -168,7 +169,7 @@ def test_interlaced_scans_are_as_good_as_others(tmp_path: Path) -> None:
     log, true = laser_drive(0, rounds=0.2, kind=LaserKind(readings=360))
     lines = []
     for row, (time, pose) in enumerate(zip(log.time, log.odometry, strict=True)):
-        both = (log.angles[row], np.nan_to_num(log.ranges[row], nan=81.91))
+        both = (log.angles[row], np.nan_to_num(log.ranges[row], nan=NO_RETURN))
         angles, ranges = (values[row % 2 :: 2] for values in both)
         at = " ".join(f"{value:.6f}" for value in pose)
         step = angles[1] - angles[0]

@@ -5,10 +5,11 @@ import bz2
 import numpy as np
 import pytest
 
-from benchmarks.scans import laser_drive, write_carmen
+from benchmarks.scans import laser_drive
 from data_tools.laser import LineMap, OccupancyGrid, ScoreGrid, read_carmen
 from saga_fg import InputError
 from saga_fg.numerics.arrays import FloatArray
+from tests.data_tools.carmen_example import write_carmen
 
 READINGS = " ".join(f"{1 + k / 10:.2f}" for k in range(11))
 FLASER = f"FLASER 11 {READINGS} 1.2 2.0 0 1.0 2.0 0 17.5 nohost 0.1\n"
