@@ -74,9 +74,9 @@ from saga_fg.model.interactions import (
 )
 from saga_fg.model.nonlinear_interactions import (
     MIN_GAP,
-    Along,
     IntelligentDriver,
     Linearised,
+    PathEnds,
     accelerated,
     speed_along,
 )
@@ -265,7 +265,7 @@ def _stopping(law: Stopping | DriverStopping, nodes: NodeTable, target: IntArray
     near = approach(nodes, target, source)
     v = speed_along(nodes, target, near.direction)
     f = law.law(v, law.gap(nodes, target, near.distance))
-    return accelerated(nodes, target, source, Along(near.direction, near.direction, v), f)
+    return accelerated(nodes, target, source, PathEnds(near.direction, near.direction, v), f)
 
 
 @dataclass(frozen=True)

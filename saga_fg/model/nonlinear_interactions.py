@@ -144,8 +144,8 @@ class IntelligentDriver(Settings):
         f = self.following(v, place.ahead - (nodes.length[target] + nodes.length[source]) / 2, w)
         at_rest = f._replace(value=f.value - f.by_leader * w)
         from_leader = u_i[:, :, None] * u_j[:, None, :] * f.by_leader[:, None, None]
-        along = Along(u_i, unit(place.direction), v)
-        return accelerated(nodes, target, source, along, at_rest, from_leader)
+        path = PathEnds(u_i, unit(place.direction), v)
+        return accelerated(nodes, target, source, path, at_rest, from_leader)
 
 
 def speed_along(nodes: NodeTable, rows: IntArray, u: FloatArray) -> FloatArray:
@@ -153,7 +153,7 @@ def speed_along(nodes: NodeTable, rows: IntArray, u: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(np.einsum("ei,ei->e", nodes.velocity[rows], u), 0.0))
 
 
-class Along(NamedTuple):
+class PathEnds(NamedTuple):
     """Unit directions (E, 2) of the path at the target and at the source, and the speeds (E,) of the target, m/s."""
 
     at_target: FloatArray
@@ -165,7 +165,7 @@ def accelerated(
     nodes: NodeTable,
     target: IntArray,
     source: IntArray,
-    path: Along,
+    path: PathEnds,
     f: Linearised,
     by_leader: FloatArray | None = None,
 ) -> Triples:
