@@ -26,12 +26,12 @@ from typing import Annotated
 import gtsam
 import numpy as np
 import typer
-from scipy.spatial.transform import Rotation
 
 from benchmarks.runner import Row, Rows, each, paired_bootstrap
 from data_tools.datasets.kitti import KittiTracking
 from data_tools.simulator import SimulatorSettings, simulate_scene
 from data_tools.trajectories import Trajectory, TrajectoryErrors, trajectory_errors
+from factors.manifolds import rotation_exp
 from pipelines.cli.options import Config
 from pipelines.config import TrackConfig, load_config
 from pipelines.slam.lidar_slam import path_tracker
@@ -176,16 +176,12 @@ def degraded_odometry(
     bias = np.zeros((n, 3))
     bias[:, 2] = slow[:, 1] * dt
     a_T_b = odometry.a_T_b.copy()
-    a_T_b[:, :3, :3] = _rotations(bias) @ a_T_b[:, :3, :3] @ _rotations(sampled[:, :3])
+    a_T_b[:, :3, :3] = rotation_exp(bias) @ a_T_b[:, :3, :3] @ rotation_exp(sampled[:, :3])
     course = np.zeros((n, 3))
     course[:, 2] = slow[:, 2]
-    turned = (_rotations(course) @ a_T_b[:, :3, 3, None])[:, :, 0]
+    turned = (rotation_exp(course) @ a_T_b[:, :3, 3, None])[:, :, 0]
     a_T_b[:, :3, 3] = turned * (1 + slow[:, :1]) + sampled[:, 3:6]
     return OdometryIncrements(odometry.timestamps, a_T_b)
-
-
-def _rotations(vector: FloatArray) -> FloatArray:
-    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
 
 
 def batch_run(scene: Scene, seed: int, config: TrackConfig, settings: JointSettings) -> Outcome:
