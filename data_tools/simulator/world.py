@@ -197,7 +197,7 @@ def scene_from_world(
     for sensor_name, sensor in settings.sensors.items():
         rng = np.random.default_rng([seed, zlib.crc32(sensor_name.encode())])  # independent of the other sensors
         own = np.random.default_rng([seed, zlib.crc32(sensor_name.encode()), 1])  # the detections' noise stays
-        times = world.start + _times(settings.duration, sensor.rate, sensor.offset)
+        times = world.start + _sampling_times(settings.duration, sensor.rate, sensor.offset)
         times = outside_outages(sensor, times, own)
         drifts = range_drifts(sensor, times, len(world.objects), own)
         for time, drift in zip(times.tolist(), drifts, strict=True):
@@ -209,7 +209,7 @@ def scene_from_world(
                 detections = Detections.concatenate([detections, lights])
             frames.append(Frame(round(date + time, 6), sensor_name, detections, pose, road_map=world.road_map))
     frames.sort(key=lambda frame: (frame.timestamp, frame.sensor))
-    keyframes = world.start + _times(settings.duration, settings.keyframe_rate, 0.0)
+    keyframes = world.start + _sampling_times(settings.duration, settings.keyframe_rate, 0.0)
     poses = np.array([world.ego_pose(time) for time in keyframes])
     return Scene(
         name=name or f"simulated-{seed}",
@@ -220,7 +220,7 @@ def scene_from_world(
     )
 
 
-def _times(duration: float, rate: float, offset: float) -> FloatArray:
+def _sampling_times(duration: float, rate: float, offset: float) -> FloatArray:
     """Times offset + k / rate, s, before the end."""
     return offset + np.arange(max(0, int(np.ceil((duration - offset) * rate - 1e-9)))) / rate
 

@@ -242,7 +242,7 @@ class RawTable:
             if name == "timestamp":
                 numbers = self.clock.seconds(numbers)
             else:
-                of, power = _measured(name)
+                of, power = _unit_column(name)
                 unit = self.how.unit(of, self.found.units.get(of))
                 numbers = numbers if unit is None else in_our_unit(of, numbers, unit, power)
         large = np.abs(numbers) > LIMITS.get(name, sys.float_info.max)
@@ -315,7 +315,7 @@ def as_names(values: Values) -> Values:
     return [str(value) if type(value) is int else value for value in values]
 
 
-def _measured(name: str) -> tuple[str, int]:
+def _unit_column(name: str) -> tuple[str, int]:
     """The column whose unit a column has, and its power: covariances have the square of what varies."""
     if name.startswith("cov_"):
         return ("vx" if name.startswith("cov_v") else "x"), 2
