@@ -238,6 +238,16 @@ class ChosenScenes:
         """Read one of the scenes."""
         return self._dataset.scene(name)
 
+    def true_scene(self, name: str) -> Scene:
+        """Read one of the scenes with all its objects, see `true_scene`."""
+        return true_scene(self._dataset, name)
+
+
+def true_scene(dataset: Dataset, name: str) -> Scene:
+    """A scene to learn from: with all objects, seen or not, of a dataset that has `true_scene`, else as it is."""
+    read: Callable[[str], Scene] = getattr(dataset, "true_scene", dataset.scene)
+    return read(name)
+
 
 @dataclass(frozen=True)
 class Surroundings:

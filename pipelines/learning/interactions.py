@@ -34,7 +34,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from data_tools.datasets.given_tracks import detected
-from data_tools.datasets.source import DatasetSource
+from data_tools.datasets.source import DatasetSource, true_scene
 from data_tools.figures import FigureTable, cell
 from data_tools.metrics.scene import match_scene
 from pipelines.config import Method, TrackConfig
@@ -396,8 +396,7 @@ def scenes_to_learn_from(source: DatasetSource, config: TrackConfig, with_truth:
     """
     if with_truth:
         with source.open(truth=True) as dataset:
-            read = getattr(dataset, "true_scene", dataset.scene)
-            return {name: _detected(read(name), config) for name in dataset.scenes}
+            return {name: _detected(true_scene(dataset, name), config) for name in dataset.scenes}
     with source.open() as dataset:
         scenes = [dataset.scene(name) for name in dataset.scenes]
     return {scene.name: _with_tracks(scene, track_scene(scene, config.new_tracker("kf")).tracks) for scene in scenes}

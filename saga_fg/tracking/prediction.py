@@ -328,7 +328,8 @@ def _hypotheses(state: TrackerState) -> list[tuple[Hypothesis, dict[int, float],
         if name == "follows":
             twin.settings = replace(state.settings, edge_prior=1.0)
         elif name == "goes on":
-            twin.rules = tuple(rule for rule, leads in zip(state.rules, leading, strict=True) if not leads)
+            rules = zip(state.rules, leading, strict=True)  # all keep their numbers, by which they are known
+            twin.rules = tuple(replace(rule, rate=0.0) if leads else rule for rule, leads in rules)
         found.append((name, dict(zip(table.id.tolist(), share.tolist(), strict=True)), twin))
     return found
 

@@ -6,11 +6,12 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from data_tools.datasets import source
-from data_tools.datasets.source import DatasetSource
+from data_tools.datasets.source import ChosenScenes, DatasetSource
 from saga_fg.errors import InputError
 from saga_fg.parts import offered
 from tests.pipelines.command import done, refused, saga_fg
@@ -181,3 +182,9 @@ def test_what_cannot_be_done_is_one_line(arguments, message, tmp_path, monkeypat
     said = refused(*arguments)
     assert said.startswith(message)
     assert len(said.splitlines()) == 1
+
+
+def test_chosen_scenes_have_all_objects_where_the_dataset_has_them():
+    seen = SimpleNamespace(scenes=("a", "b"), scene=lambda name: f"{name}, seen")
+    known = SimpleNamespace(**vars(seen), true_scene=lambda name: f"{name}, all")
+    assert [ChosenScenes(each, "b").true_scene("b") for each in (seen, known)] == ["b, seen", "b, all"]

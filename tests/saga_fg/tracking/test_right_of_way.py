@@ -9,6 +9,7 @@ from saga_fg import Boxes, Detections, Frame, Tracker, TrackerSettings
 from saga_fg.errors import InputError
 from saga_fg.kernels.paths import path_meetings
 from saga_fg.model import NodeTable, Paths
+from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.tracking.edge_record import Lines
 from saga_fg.tracking.right_of_way import RightOfWay, free_time, probabilities
 from saga_fg.tracking.table_tracking import dense_traffic_settings
@@ -340,6 +341,19 @@ def test_modes_tell_who_waits_follows_or_goes_on_beside_the_same_mean():
     assert waits.position[1, row, 1] < goes.position[1, row, 1] - 1.0
     with pytest.raises(InputError, match="joint or hypotheses"):
         tracker.predict([1.0], joint=True, hypotheses=True)
+
+
+def test_modes_know_rules_by_their_numbers_where_leaders_are_left_out():
+    """Neighbours are judged by how well they predicted, whether they are the first rule or the last."""
+    going = []
+    for edges in ((Following(), Neighbours()), (Neighbours(), Following())):
+        tracker = Tracker(replace(dense_traffic_settings(), edges=edges, edge_prior=0.5))
+        for k in range(60):
+            places = [(1.0 * k, 0.0, 0.8), (1.0 * k + 20.0 + 4.0 * np.sin(0.15 * k), 0.0, 0.8)]
+            boxes = Boxes.of(["car"] * 2, places, [[4.5, 1.8, 1.6]] * 2, [EAST] * 2)
+            tracker.step(Frame(0.1 * k, "lidar", Detections(boxes, np.full(2, 0.9))))
+        going.append(next(mode for mode in tracker.predict([2.0], hypotheses=True).modes if mode.name == "goes on"))
+    np.testing.assert_allclose(going[0].position, going[1].position, atol=1e-9)
 
 
 def test_who_yields_goes_with_the_tracks_and_through_a_snapshot():
