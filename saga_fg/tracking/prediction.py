@@ -314,9 +314,9 @@ def _hypotheses(state: TrackerState) -> list[tuple[Hypothesis, dict[int, float],
     nodes = node_table(state, predicted_paths(state, np.ones(len(table), dtype=np.bool_), LOOKAHEAD_STEP))
     governing = state.edge_record.governing(state.rules, state.halting, state.settings.edge_prior, state.time)
     follows, waits = np.zeros(len(nodes)), state.right_of_way.waiting(table.id)
-    leading = [answers(rule) and isinstance(rule, Following) for rule in state.rules]
-    for number, rule in enumerate(state.rules):
-        if leading[number] and governing is not None:
+    leading = {k: rule for k, rule in enumerate(state.rules) if isinstance(rule, Following) and answers(rule)}
+    for number, rule in leading.items():
+        if governing is not None:
             target, source, _ = rule.pairs(nodes)
             np.maximum.at(follows, target, governing(number, nodes, target, source))
     led = (1 - waits) * follows[: len(table)]
@@ -328,8 +328,8 @@ def _hypotheses(state: TrackerState) -> list[tuple[Hypothesis, dict[int, float],
         if name == "follows":
             twin.settings = replace(state.settings, edge_prior=1.0)
         elif name == "goes on":
-            rules = zip(state.rules, leading, strict=True)  # all keep their numbers, by which they are known
-            twin.rules = tuple(replace(rule, rate=0.0) if leads else rule for rule, leads in rules)
+            without = {number: replace(rule, rate=0.0) for number, rule in leading.items()}  # all keep their numbers
+            twin.rules = tuple(without.get(number, rule) for number, rule in enumerate(state.rules))
         found.append((name, dict(zip(table.id.tolist(), share.tolist(), strict=True)), twin))
     return found
 
