@@ -122,12 +122,12 @@ ELONGATED, SHARED, MOST = 1.5, 0.25, 3.0  # length by width of what stands in ro
 
 
 def constant_sizes(owner: IntArray, count: int, size: FloatArray, weight: FloatArray) -> FloatArray:
-    """(count, 3) length, width, height of each object, m, NaN where none was measured.
+    """(count, 3) length, width, height of each object, m, each NaN where it was not measured.
 
     owner (m,): row of the object of each detection; size (m, 3), NaN for unmeasured; weight (m,): of the size
     """
-    known = np.isfinite(size).all(axis=1)
-    columns = [weighted_medians(owner[known], count, column[known], weight[known]) for column in size.T]
+    known = np.isfinite(size).T
+    columns = [weighted_medians(owner[k], count, side[k], weight[k]) for side, k in zip(size.T, known, strict=True)]
     return np.stack(columns, axis=-1)
 
 

@@ -210,8 +210,8 @@ class ObjectSummary:
         """Add detections (m,): the sum of their probabilities, size (m, 3) in m, NaN for unmeasured, and its weight."""
         self.probability += probability
         self.detections += len(size)
-        known = np.isfinite(size).all(axis=1)
         for axis, values in enumerate(self.sizes):
+            known = np.isfinite(size[:, axis])
             more = np.concatenate([values, np.array([size[known, axis], weight[known]])], axis=1)
             if more.shape[1] > MAX_VALUES:
                 steps, index = np.unique(np.rint(more[0] / RESOLUTION), return_inverse=True)
@@ -232,8 +232,8 @@ class ObjectSummary:
 
     def close(self) -> None:
         """Keep the medians of the sizes alone, weighted by the number of detections."""
-        if self.sizes[0].shape[1]:
-            self.sizes = [np.array([[size], [float(self.detections)]]) for size in median_sizes([self])[0]]
+        medians = median_sizes([self])[0]
+        self.sizes = [np.array([[size], [float(self.detections)]])[:, : int(np.isfinite(size))] for size in medians]
 
 
 def median_sizes(summaries: Sequence[ObjectSummary]) -> FloatArray:

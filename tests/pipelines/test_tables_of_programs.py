@@ -126,6 +126,13 @@ def test_labels_say_how_many_they_are():
     assert repr(labels).startswith("labels of 1 scenes, 90 boxes")
 
 
+def test_labels_of_boxes_seen_from_above_keep_their_sizes():
+    found = saga_fg.smooth(DETECTIONS.assign(length=4.5, width=1.8)).boxes()
+    assert found["length"].to_numpy() == pytest.approx(4.5)
+    assert found["width"].to_numpy() == pytest.approx(1.8)
+    assert found["height"].isna().all()
+
+
 def test_what_mends_a_table_is_named_as_each_function_takes_it(tracks, subtests):
     """What a stop names, put into the call that stopped, makes it go on."""
     slow, theirs = (

@@ -203,6 +203,9 @@ def test_sizes_follow_the_weight_and_objects_do_not_mix():
     found = constant_sizes(owner, 3, size, probability)
     assert 4.0 <= found[0, 0] <= 4.2
     assert np.isnan(found[1:]).all()
+    seen_from_above = constant_sizes(owner, 3, size * [1.0, 1.0, np.nan], probability)
+    assert np.array_equal(seen_from_above[:, :2], found[:, :2], equal_nan=True)
+    assert np.isnan(seen_from_above[:, 2]).all()
     states = chain(2, objects=2)
     assert states.previous.tolist() == [-1, -1, 0, 1]
     readings = scalar_readings(np.array([0, 0, 3]), np.array([1.0, 3.0, 9.0]), np.ones(3))
