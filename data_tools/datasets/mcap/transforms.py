@@ -254,5 +254,7 @@ def find_places(
 
 
 def check_frame(tree: TransformTree, frame: str) -> None:
+    if not tree.frames:
+        raise InputError(f"frame {frame!r}: there are no transforms so far; --world {frame} if it stands still")
     if frame not in tree.frames:
         raise InputError(unknown_name("frame", frame, tree.frames))

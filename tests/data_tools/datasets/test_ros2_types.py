@@ -160,6 +160,8 @@ def test_a_buffer_has_the_transforms_that_a_recording_would_have():
 
 def test_a_buffer_follows_a_clock_that_is_set_back_and_refuses_what_is_no_transform():
     buffer = TransformBuffer()
+    with pytest.raises(InputError, match="frame 'mast': there are no transforms so far; --world mast"):
+        place_of(buffer, "mast", 3.0, hold=0.0)
     buffer.add(transform("base_link", "map", 1000.0, 5.0))
     buffer.add(transform("base_link", "map", 3.0, 7.0))
     assert place_of(buffer, "base_link", 3.0, hold=0.0).known.all()
