@@ -200,8 +200,7 @@ class DetectionFileSource(DatasetSource):
         return self.how.values()
 
     def with_kept(self, kept: Mapping[str, Any]) -> Self:
-        given = (self.columns, self.classes, self.units, self.coordinates, self.table_import, self.sort or None)
-        if any(each is not None for each in given) or not kept:
+        if self.table_import is not None or not kept:
             return self
         known = {field.name for field in fields(TableImport)}
         try:

@@ -104,6 +104,17 @@ def test_tracks_of_another_tracker_and_its_own_clock(tmp_path):
         assert figures["hota"]["car"]["centre"]["hota"] > 0.85
 
 
+def test_options_add_to_how_the_run_read_its_tables(tmp_path):
+    names = ("zeit_ms", "nr", "ost", "nord")
+    lines = [(100 * k, n, k - 12.0 * n, 0.0) for k in range(30) for n in range(3)]
+    write(tmp_path / "found.csv", [dict(zip(names, line, strict=True)) for line in lines])
+    read = ("--columns", "timestamp=zeit_ms,x=ost,y=nord", "--units", "time=ms")
+    assert saga_fg("track", "file", tmp_path / "found.csv", *read, "-o", tmp_path / "tracks.csv").exit_code == 0
+    judged = ("evaluate", "file", tmp_path / "tracks.csv", "--truth", tmp_path / "found.csv")
+    assert saga_fg(*judged).exit_code == 2
+    assert saga_fg(*judged, "--columns", "id=nr").exit_code == 0
+
+
 def test_tracks_that_do_not_fit_the_truth(tmp_path):
     for change, message in [
         ({"ts_ns": lambda t: t + 10**12}, "expected tracks at the times of the ground truth"),
