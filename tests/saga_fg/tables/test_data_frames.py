@@ -223,7 +223,7 @@ def test_usual_tables_are_not_warned_of():
     saga_fg.track(table(label=["car", "dog"] * 12, score=[0.0, 1.0] * 12, yaw=[6.28, -6.28] * 12))
     saga_fg.track(table(label="car", score=3.0), sensors={"default": saga_fg.Sensor(score="logit")})
     saga_fg.track(table())
-    saga_fg.track(table(label="DRONE"), saga_fg.TrackerSettings(edges=()))
+    saga_fg.track(table(label="DRONE"), saga_fg.TrackerSettings(edges=(), min_hits=2))
 
 
 def test_pandas_is_imported_when_asked_for_and_named_where_missing(monkeypatch):
