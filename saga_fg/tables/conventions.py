@@ -227,9 +227,9 @@ def fitting_convention(
     better &= now > 0.5 or turned > 0.1  # some that are turned round are no convention
     if better and astray < 0.2 and off < _OFF:
         return best, said
-    if best in _CONVENTIONS and usual > max(2 * off, 0.08):  # as of mirrored headings nearly along an axis
-        return f"{_NEARLY}{best}", said
     constant = np.ptp(given) < 1e-6
+    if best in _CONVENTIONS and not constant and usual > max(2 * off, 0.08):  # as of mirrored ones nearly along an axis
+        return f"{_NEARLY}{best}", said
     if now > 0.5 and (constant or not walks[moves].any()):
         return "", said
     return ("rad", said) if now < 0.15 and usual < _OFF else None

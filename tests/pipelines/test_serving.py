@@ -54,7 +54,7 @@ def test_what_looks_wrong_in_a_stream_is_told_once(caplog):
         service: StreamTracker[str] = StreamTracker(partial(config.new_tracker, "saga"), SETTINGS, Checks(config))
         caplog.clear()
         for k in range(250):
-            yaw = (90.0 if k % 2 else 270.0) if degrees else 0.02
+            yaw = (90.0 if k % 2 else 270.0) if degrees else 0.1
             car = {"label": "car", "x": 1.0 * k, "y": 2.0, "score": 90.0 if degrees else 0.9, "yaw": yaw}
             answers(service, encode({"timestamp": 0.1 * k, "detections": [car]}))
         told = [record.getMessage().partition(":")[0] for record in caplog.records]
