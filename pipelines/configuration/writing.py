@@ -25,6 +25,7 @@ from pipelines.configuration.reading import (
     Table,
     settings_of,
 )
+from saga_fg.parts import part_name
 
 WIDTH = 120
 EVERYTHING = ("",)  # the selection of a whole section
@@ -100,7 +101,7 @@ def _form(
     match schema:
         case Section() if not isinstance(value, str):
             if hasattr(value, "__qualname__"):  # a class or a function
-                return scalar_text(f"{value.__module__}:{value.__qualname__}")
+                return scalar_text(part_name(value))
             return _section_lines(schema, value, base, comments, selection) or "{}"
         case Table(value=inner):
             return _table_lines(inner, value, base, comments, selection) or "{}"

@@ -29,6 +29,7 @@ from pipelines.scale_out import file_name
 from pipelines.smoothing import SmoothConfig
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import FloatArray, transform_points
+from saga_fg.parts import part_name
 from saga_fg.smoothing.corrections import correction_from
 from saga_fg.types import Dataset, Scene
 
@@ -61,7 +62,7 @@ class LabelRun:
     ) -> Self:
         """A run of this process; options are left out that YAML can't hold, of a dataset of somebody else."""
         kind, options = type(source), ""
-        name = kind.name if kind.name in dataset_names() else f"{kind.__module__}:{kind.__qualname__}"
+        name = kind.name if kind.name in dataset_names() else part_name(kind)
         with suppress(TypeError):
             options = write_settings(source, comments=False)
         return cls(

@@ -35,6 +35,7 @@ from saga_fg.graph import FactorProvider, SceneFactorGraph
 from saga_fg.kernels.components import planar_marginals
 from saga_fg.model import Transition
 from saga_fg.numerics import BoolArray, FloatArray, IntArray
+from saga_fg.parts import part_name
 from saga_fg.types import Frame
 
 
@@ -155,13 +156,13 @@ class Estimator(ABC):
 
     def snapshot(self) -> Any:
         """The whole state as a value, which can be pickled."""
-        return EstimatorState(_kind(self), self._own_attributes())
+        return EstimatorState(part_name(self), self._own_attributes())
 
     def restore(self, state: Any) -> None:
         """Continue from a snapshot of an estimator of the same kind; raises `InputError` for anything else."""
         require_type("state", state, EstimatorState)
-        if state.kind != _kind(self):
-            raise InputError(f"state: expected one of {_kind(self)}, got one of {state.kind}")
+        if state.kind != part_name(self):
+            raise InputError(f"state: expected one of {part_name(self)}, got one of {state.kind}")
         vars(self).update(deepcopy(dict(state.attributes)))
 
     def __copy__(self) -> Self:
@@ -201,7 +202,3 @@ class Estimator(ABC):
 
     def _own_attributes(self) -> dict[str, Any]:
         return deepcopy({name: value for name, value in vars(self).items() if name != "providers"})
-
-
-def _kind(estimator: object) -> str:
-    return f"{type(estimator).__module__}:{type(estimator).__qualname__}"
