@@ -26,7 +26,7 @@ SCENES = 3  # of a dataset, whose first frames are judged
 
 
 def options_of(source: DatasetSource) -> Callable[[Mend], str]:
-    """What gives the options of the command that mend a suspicion, of a dataset that has a `TableImport`, `how`."""
+    """Return the function from a `Mend` to options of the command; "" for datasets that no `TableImport` reads."""
     how = getattr(source, "how", None)
     return lambda mend: "" if how is None else how.option_for(mend, {})
 

@@ -172,7 +172,7 @@ def _cells(points: FloatArray, cell: float) -> IntArray:
     return np.asarray(keys[:, 0] * 4_000_037 + keys[:, 1])
 
 
-_MOST_CELLS = 50_000_000
+_MAX_CELLS = 50_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +190,7 @@ class OccupancyGrid:
         ends = [scan @ T[:2, :2].T + T[:2, 2] for scan, T in zip(scans, world_T_laser, strict=True)]
         every = np.concatenate([*ends, world_T_laser[:, :2, 2]])
         low, high = every.min(axis=0), every.max(axis=0)
-        cell = max(cell, float(np.sqrt(np.prod(high - low + 2 * cell) / _MOST_CELLS)))
+        cell = max(cell, float(np.sqrt(np.prod(high - low + 2 * cell) / _MAX_CELLS)))
         origin = low - cell
         size = np.ceil((high - origin) / cell).astype(int) + 1
         hits, misses = np.zeros(int(size.prod())), np.zeros(int(size.prod()))

@@ -26,7 +26,7 @@ from saga_fg.errors import InputError
 
 @dataclass(frozen=True)
 class InsteadOptions:
-    """What is made of the labels, or read from a labelling tool, in place of a page that is served."""
+    """Outputs other than the served page: a page as a file, an export, or edits to import."""
 
     page: Annotated[
         Path | None,

@@ -315,7 +315,7 @@ class LaserLoops(LoopSearch):
 _NEARBY = 3.0  # m between keyframes that see the same walls
 _GAP = 5.0  # m travelled without a keyframe nearby, from which on it is another pass
 _SHARED = 3  # keyframes in a row that share a map
-_MOST_PASSES = 4  # that a keyframe is registered with
+_MAX_PASSES = 4  # that a keyframe is registered with
 _PRIOR = np.diag([100.0, 100.0, 1000.0])  # information of the graph about where the other pass is
 
 
@@ -338,7 +338,7 @@ def registered_passes(
             continue
         runs = np.split(others, np.flatnonzero(np.diff(travelled[others]) > _GAP) + 1)
         nearest = sorted((int(run[np.argmin(apart[run])]) for run in runs), key=lambda k: apart[k])
-        for other in dict.fromkeys(near // _SHARED * _SHARED for near in nearest[:_MOST_PASSES]):
+        for other in dict.fromkeys(near // _SHARED * _SHARED for near in nearest[:_MAX_PASSES]):
             if other not in maps:
                 around = [frame for frame in frames if abs(frame.travelled - travelled[other]) < LOCAL_MAP / 3]
                 maps[other] = LineMap.of(joined(around, frames[other]))

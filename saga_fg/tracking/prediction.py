@@ -309,7 +309,7 @@ def look_ahead(
 
 
 def _hypotheses(state: TrackerState) -> list[tuple[Hypothesis, dict[int, float], TrackerState]]:
-    """What those that move may do, with the probability of each by id, and a state in which all do so."""
+    """Hypotheses of moving objects: name, probability by id, and a copy of the state in which it holds for all."""
     table = state.table
     nodes = node_table(state, predicted_paths(state, np.ones(len(table), dtype=np.bool_), LOOKAHEAD_STEP))
     governing = state.edge_record.governing(state.rules, state.halting, state.settings.edge_prior, state.time)

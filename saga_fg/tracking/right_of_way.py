@@ -67,11 +67,11 @@ WALKS = 26  # 1 where the first one is a person, -1 where the second one is, 0 w
 
 
 class Meetings(NamedTuple):
-    """E ordered pairs of vehicles whose paths meet: rows (E, 2); way (E, 2), m, from the middle of each to the point;
-    cosine (E,) between their courses there."""
+    """E ordered pairs of vehicles whose paths meet: rows (E, 2); distance (E, 2), m, from the middle of each to
+    the point; cosine (E,) between their courses there."""
 
     rows: IntArray
-    way: FloatArray
+    distance: FloatArray
     cosine: FloatArray
 
 
@@ -175,7 +175,7 @@ class RightOfWay:
         to_line, halts, alone = lines.next_of(nodes.position[rows], heading)
         usual = np.full(len(rows), np.inf)
         usually = np.where(walks[meetings.rows], STANDS, np.where(meetings.cosine > ALIKE, JOINING, CROSSING)[:, None])
-        before = meetings.way - half[meetings.rows] - usually
+        before = meetings.distance - half[meetings.rows] - usually
         np.minimum.at(usual, meetings.rows, before)
         to_line = np.where(np.isfinite(to_line), to_line, usual)
         near = {node: d for node, d in zip(ids, to_line.tolist(), strict=True) if d <= LOOKS}
@@ -242,29 +242,29 @@ def _meetings(
     people = walks[pair].sum(axis=1)
     kept = (people == 0) | ((people == 1) & crosses)
     pair, at = pair[kept], at[kept]
-    way, angle = SPACING * (at - BEHIND), course[pair, at]
+    distance, angle = SPACING * (at - BEHIND), course[pair, at]
     cosine = np.cos(angle[:, 0] - angle[:, 1])
-    lead, begins = np.full(len(paths), np.inf), way <= SPACING
+    lead, begins = np.full(len(paths), np.inf), distance <= SPACING
     in_line = (cosine > ALIKE) & begins.any(axis=1)
     own = np.where(begins[:, 0], 1, 0)[in_line]
     each = np.arange(len(own))
-    gap = way[in_line][each, own] - way[in_line][each, 1 - own]
+    gap = distance[in_line][each, own] - distance[in_line][each, 1 - own]
     follows = gap > 0
     np.minimum.at(lead, pair[in_line][each, own][follows], gap[follows])
     met = np.flatnonzero(~in_line & (cosine > HEAD_ON))
-    rows, ways = (np.concatenate([each[met], each[met, ::-1]]) for each in (pair, way))
-    return Meetings(rows, ways, np.tile(cosine[met], 2)), lead
+    rows, distances = (np.concatenate([each[met], each[met, ::-1]]) for each in (pair, distance))
+    return Meetings(rows, distances, np.tile(cosine[met], 2)), lead
 
 
 def _evidence(meetings: Meetings, columns: FloatArray) -> FloatArray:
     """(E, F) evidence on pairs i, j, of order one, by half lengths, speeds and so on (k, 8) of each."""
     half, speed, acceleration, to_line, halts, lead, arrival, walks = np.moveaxis(columns[meetings.rows], 2, 0)
-    front, later = meetings.way - half, np.clip(arrival[:, 0] - arrival[:, 1], -3.0, 3.0)
+    front, later = meetings.distance - half, np.clip(arrival[:, 0] - arrival[:, 1], -3.0, 3.0)
     comes = np.maximum(front, 0.0) / np.maximum(speed, np.where(walks > 0, LINGERS, SLOW))
     braking = speed**2 / (8 * np.maximum(to_line, 0.3))
     both = (
         np.clip(front, -5.0, 50.0) / 20,
-        np.clip(meetings.way + half, -4.0, 8.0) / 4,
+        np.clip(meetings.distance + half, -4.0, 8.0) / 4,
         np.clip(to_line, -6.0, 40.0) / 15,
         speed / 8,
         np.clip(acceleration, -3.0, 3.0) / 2,
@@ -272,7 +272,7 @@ def _evidence(meetings: Meetings, columns: FloatArray) -> FloatArray:
         np.minimum(comes, 10.0) / 4,
         np.minimum(braking, 2.0),
         np.clip(lead - np.maximum(to_line, 0.0) - 2, -8.0, 4.0) / 6,
-        np.clip(lead - meetings.way, -8.0, 8.0) / 8,
+        np.clip(lead - meetings.distance, -8.0, 8.0) / 8,
         halts,
     )
     first = walks[:, 0] - walks[:, 1]

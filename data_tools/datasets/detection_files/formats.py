@@ -251,7 +251,7 @@ Nested = dict[tuple[str, ...], Any]
 
 
 class EmptyFrame(dict[str, Any]):
-    """What a line says of a frame whose list of objects is empty."""
+    """A row of a frame without objects: the values of the frame itself."""
 
 
 def _json_rows(path: Path, file: TextIO) -> Iterator[tuple[int, dict[str, Any]]]:

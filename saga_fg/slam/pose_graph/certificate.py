@@ -48,7 +48,7 @@ _ACCEPTED, _POOR, _GOOD = 0.05, 0.25, 0.9  # shares of the promised decrease: to
 _STEP_ROUNDING = 1e-13  # of the cost: differences below are noise
 _MIN_DECREASE = 1e-11  # of the cost: a step that promises less, and does not hold it, meets rounding
 _MIN_RADIUS = 1e-12  # of steps: below, none decreases the cost
-_MOST_STEPS, _MOST_INNER = 200, 300
+_MAX_STEPS, _MAX_INNER = 200, 300
 
 
 @dataclass(eq=False)
@@ -121,10 +121,10 @@ def best_frames(
     here = Frames(Q, preconditioner, np.ascontiguousarray(Y))
     radius = np.sqrt(Y.shape[0] * Y.shape[1]) / 8
     products = 0
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         if here.slope <= tolerance * here.cost or radius < _MIN_RADIUS or products >= most_products:
             break
-        step, promised, at_bound, count = _truncated_cg(here, radius, min(_MOST_INNER, most_products - products))
+        step, promised, at_bound, count = _truncated_cg(here, radius, min(_MAX_INNER, most_products - products))
         products += count + 1
         there = Frames(Q, preconditioner, nearest_frames(Y + step))
         noise = _STEP_ROUNDING * here.cost
@@ -175,7 +175,7 @@ MOST_DIMENSIONS = 7  # more than d of the frames; the staircase ends far lower, 
 _ROUNDING = 1e-11  # of the largest entry of S: eigenvalues nearer to 0 can't be told from it
 _CONVERGED = 1e-14  # decrease that a step still promises, relative to the cost: rounding
 _NEARLY = 1e-10  # the same for frames of more dimensions: slow where some are superfluous, and the bound holds anyhow
-_MOST_WORK = 5e9  # products with Q, times entries of its factors: half a minute in all, then the bound is a loose one
+_MAX_WORK = 5e9  # products with Q, times entries of its factors: half a minute in all, then the bound is a loose one
 _SHORTEST = 1e-8  # step along an eigenvector, of a length of sqrt(N d) in all
 _ACCURACY = 1e-4  # of an eigenvalue, relative to the shift
 _MIN_COST = 1e-13  # cost that counts as none, relative to the trace of M: rounding, where all measurements agree
@@ -216,7 +216,7 @@ def chordal_minimum(graph: PoseGraph, start: FloatArray) -> ChordalMinimum:
     if graph.anchored:
         start = np.concatenate([start, np.eye(d + 1)[None]])
     proofs: list[tuple[float, float, int]] = []  # bound, eigenvalue, dimensions
-    most = _MOST_WORK / cost.entries
+    most = _MAX_WORK / cost.entries
 
     def tested(frames: Frames) -> LowestEigenvalue:
         n, _, r = frames.Y.shape

@@ -223,7 +223,7 @@ PROBABILITY = 0.99  # of a true loop within c
 _CERTAIN = 0.999  # of a true loop within the gate: few of many loops may be lost
 _TAILS = 8.0  # m: loops of recordings have tails far longer than Gaussian ones
 _FEWEST = 8  # loops that tell a variance of unit weight
-_MOST_ROUNDS = 50
+_MAX_ROUNDS = 50
 _MAX_STAGES = 200
 _STEP = 1.4  # of mu, as in the paper
 _BINARY = 1e-6  # distance from 0 or 1 at which a weight counts as there
@@ -387,7 +387,7 @@ def _snooped(
 ) -> tuple[gtsam.Values, BoolArray]:
     """Take loops out and in, until all that are in pass the gate, and none besides."""
     rows, kept, seen = np.flatnonzero(loop), kept.copy(), {kept.tobytes()}
-    for _ in range(_MOST_ROUNDS):
+    for _ in range(_MAX_ROUNDS):
         values = problem.solved(values, kept)
         squares, inside = _judged(problem, values, rows, kept), kept[rows]
         gate = float(chi2.ppf(_CERTAIN, problem.k))

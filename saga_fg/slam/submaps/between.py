@@ -227,7 +227,7 @@ _MAX_INFLATION = np.log(1e3)  # log of the largest inflation
 _STARTS = (1.0, 3.0, 10.0, 30.0)  # inflations with which loops are chosen
 _FIRST = PosePriors(np.zeros(1, dtype=np.int64), np.eye(4)[None], np.eye(6)[None])  # of the anchors, anywhere
 _SIMPLEX = np.array([[0.0, 0.0], [0.7, 0.0], [0.0, 0.7]])
-_MOST_CHOICES, _PRECISION = (
+_MAX_CHOICES, _PRECISION = (
     12,
     {"xatol": 0.05, "fatol": 0.2, "maxfev": 40},
 )  # of loops, that are fitted; of logarithms of inflations and their cost
@@ -274,7 +274,7 @@ def select_loops(motions: Sequence[Motion], anchors: Sequence[int], loops: Seque
     for kept, start in choices:
         if (name := kept.tobytes()) not in found:
             found[name], costs[name] = drive.fitted(kept, start)
-            if len(choices) < _MOST_CHOICES:
+            if len(choices) < _MAX_CHOICES:
                 choices.append((drive.agreeing(found[name].inflation), found[name].inflation))
     return found[min(costs, key=costs.__getitem__)]
 
