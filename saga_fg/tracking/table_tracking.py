@@ -109,15 +109,18 @@ def dense_traffic_settings() -> TrackerSettings:
     )
 
 
+@cache
+def plain_settings() -> TrackerSettings:
+    """Settings for a table that is no dense traffic: most detectors have false boxes that never come twice."""
+    return TrackerSettings(min_hits=2)
+
+
 Like = Literal["plain", "dense"]
 """Settings that begin with a table: those for dense road traffic, or the plain ones."""
 
 UNKNOWN_SENSORS: Mapping[str, Sensor] = {DEFAULT: Sensor(calibrate_noise=True, clutter_area=5000.0)}
 """Models of sensors of which nothing is known: their detections tell how noisy they are, and their scores how many of a
 frame are false."""
-
-PLAIN = TrackerSettings(min_hits=2)
-"""Settings for a table that is no dense traffic: most detectors have false boxes that never come twice."""
 
 UNNAMED = "object"
 """Class of detections without a column of classes; any name will do."""
@@ -219,7 +222,7 @@ def _tell_default(settings: TrackerSettings | None, like: Like | None) -> None:
     """Warn, at the caller's caller, of a default that fits no table."""
     if like is None and isinstance(settings, TrackerSettings) and settings.min_hits == TrackerSettings().min_hits:
         what = f"settings: min_hits is at its default, {settings.min_hits}"
-        what = f"{what}, where tables without settings have {PLAIN.min_hits}"
+        what = f"{what}, where tables without settings have {plain_settings().min_hits}"
         warnings.warn(f"{what}: like='plain' keeps what fits them for all that settings leave out", stacklevel=3)
 
 
@@ -278,7 +281,7 @@ def read_scenes(
     if why:
         warnings.warn(f"settings for dense traffic: {why}; like='plain' takes others", stacklevel=3)
     given, like = like is not None, like or ("dense" if why else "plain")
-    fits, usual = dense_traffic_settings() if like == "dense" else PLAIN, TrackerSettings()
+    fits, usual = dense_traffic_settings() if like == "dense" else plain_settings(), TrackerSettings()
     if settings is None:
         settings = fits
     elif given:
@@ -321,7 +324,7 @@ class IdentityTracker:
         if not frame_rate > 0:
             raise InputError(f"frame_rate: expected a number > 0, got {frame_rate!r}")
         self.camera, self.frame_rate, self.classes = camera, frame_rate, dict(classes or {})
-        self.tracker = Tracker(settings or PLAIN, {} if sensor is None else {SENSOR: sensor})
+        self.tracker = Tracker(settings or plain_settings(), {} if sensor is None else {SENSOR: sensor})
         self._time = 0.0
 
     def update(self, detections: D, timestamp: float | None = None) -> D:
