@@ -423,19 +423,17 @@ class TableLabels:
 
 def smooth(
     detections: Table,
-    settings: TrackerSettings | None = None,
+    settings: TrackerSettings | Like | None = None,
     sensors: Mapping[str, Sensor] | None = None,
     smoothing: SmoothingSettings | None = None,
     corrections: Iterable[Correction | Mapping[str, Any]] = (),
     how: TableImport | None = None,
-    like: Like | None = None,
     method: Method = "saga",
-    estimator: str | None = None,
 ) -> TableLabels:
     """Label a table of detections, of pandas, Polars or Arrow, with past and future of every object.
 
-    detections, settings, sensors, how, like, method, estimator  as of `saga_fg.track`; by default labels begin with an
-                 object's first detection
+    detections, settings, sensors, how, method  as of `saga_fg.track`; by default labels begin with an object's first
+                 detection
     smoothing    settings of the passes over the whole table; by default without edges where traffic is dense
     corrections  by a person, as `Correction` or as a mapping like a line of a file of corrections
 
@@ -443,11 +441,11 @@ def smooth(
     table or a correction that can't be used.
     """
     given = checked_corrections(corrections)
-    found = read_scenes(detections, how, settings, sensors, like, method, estimator)
-    if settings is None or settings.min_hits == TrackerSettings().min_hits:
+    found = read_scenes(detections, how, settings, sensors, method)
+    if not isinstance(settings, TrackerSettings):
         found = found._replace(settings=replace(found.settings, min_hits=1))
     labels, outcomes = {}, []
-    smoothing = SmoothingSettings(edges=found.like == "plain") if smoothing is None else smoothing
+    smoothing = SmoothingSettings(edges=not found.dense) if smoothing is None else smoothing
     for scene in found.scenes:
         mine = corrections_in(scene.name, given)
         model = LabelModel(found.settings, found.sensors, smoothing, (), mine)

@@ -21,7 +21,7 @@ from .settings import (
     TrackerSettings,
     TypicalSize,
 )
-from .table_tracking import IdentityTracker, Like, dense_traffic_settings, predict, read_scenes, track
+from .table_tracking import IdentityTracker, Like, dense_traffic_settings, plain_settings, predict, read_scenes, track
 from .track_filters import MOVING, Kinematics, TurnRate
 from .track_table import SensorEvidence, TrackTable
 from .tracker import Tracker
@@ -69,6 +69,7 @@ __all__ = [
     "frame_measurements",
     "motion_of",
     "of_scene",
+    "plain_settings",
     "predict",
     "predict_state",
     "read_scenes",

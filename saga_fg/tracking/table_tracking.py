@@ -13,7 +13,6 @@ import copy
 import warnings
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import fields, replace
 from functools import cache
 from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
@@ -116,7 +115,7 @@ def plain_settings() -> TrackerSettings:
 
 
 Like = Literal["plain", "dense"]
-"""Settings that begin with a table: those for dense road traffic, or the plain ones."""
+"""Settings by name: `plain_settings`, or `dense_traffic_settings`."""
 
 UNKNOWN_SENSORS: Mapping[str, Sensor] = {DEFAULT: Sensor(calibrate_noise=True, clutter_area=5000.0)}
 """Models of sensors of which nothing is known: their detections tell how noisy they are, and their scores how many of a
@@ -128,34 +127,31 @@ UNNAMED = "object"
 
 def track(
     detections: Table,
-    settings: TrackerSettings | None = None,
+    settings: TrackerSettings | Like | None = None,
     sensors: Mapping[str, Sensor] | None = None,
     how: TableImport | None = None,
-    like: Like | None = None,
     method: Method = "saga",
-    estimator: str | None = None,
 ) -> Table:
     """Track a table of detections, of pandas, Polars or Arrow, and return one of tracks, a row for each and moment.
 
     detections  a row for each: timestamp (s, or dates), x, y (m), and where known z, label, score, sensor, length,
                 width, height, yaw (rad), vx, vy, range_rate, cov_xx, cov_xy, cov_yy (m^2), scene, and ego_x,
                 ego_y, ego_yaw, the vehicle's pose; a row without x and y is a moment at which nothing was detected
-    settings    of the tracker; by default those that `like` names, or that fit the first scene
+    settings    of the tracker, such as `replace(saga_fg.tracking.plain_settings(), estimator="isam2")`; dense: for
+                road traffic seen by a sensor that stands or hovers; plain: for all else, where tracks are reported
+                from their second detection on; by default those of the two that fit the first scene
     sensors     models by name of the sensor; by default the noise of each is told by its detections
     how         what it takes to understand the table: columns, classes, units, coordinates, as_given
-    like        dense: settings for road traffic seen by a sensor that stands or hovers; plain: for all else, where
-                tracks are reported from their second detection on; beside settings, for those left at their defaults
     method      saga, kf (without edges, trails and lanes), or centerpoint (greedy nearest centre, with settings of its
                 own)
-    estimator   kalman, isam2, fixed-lag, or one of your own, in place of that of the settings
 
     Frames are taken in order of time, each by what came before it. The table of tracks is of the same kind; it has a
     column `scene` if the detections have one, and each scene has a tracker of its own. Warns (`UserWarning`) of what is
     probably wrong, by the checks of `saga-fg inspect`. Raises `InputError` for a table that can't be used, and for one
     whose contents contradict how it is read: units of angles, times, lengths or speeds, coordinates, exchanged columns.
     """
-    _tell_default(settings, like)
-    found = read_scenes(detections, how, settings, sensors, like, method, estimator)
+    _tell_default(settings)
+    found = read_scenes(detections, how, settings, sensors, method)
     parts = []
     for scene in found.scenes:
         tracker = found.new_tracker()
@@ -171,12 +167,10 @@ def predict(
     horizons: ArrayLike = HORIZONS,
     times: ArrayLike | None = None,
     modes: bool = False,
-    settings: TrackerSettings | None = None,
+    settings: TrackerSettings | Like | None = None,
     sensors: Mapping[str, Sensor] | None = None,
     how: TableImport | None = None,
-    like: Like | None = None,
     method: Method = "saga",
-    estimator: str | None = None,
 ) -> Table:
     """Predict where all tracks of a table of detections will be, and return a table: a row for each track and horizon.
 
@@ -194,8 +188,8 @@ def predict(
     ahead, wanted = checked_horizons(horizons), None if times is None else np.sort(checked("times", times, (None,)))
     if method == "centerpoint":
         raise InputError("method: expected saga or kf, centerpoint predicts nothing")
-    _tell_default(settings, like)
-    found = read_scenes(detections, how, settings, sensors, like, method, estimator)
+    _tell_default(settings)
+    found = read_scenes(detections, how, settings, sensors, method)
     parts, left_out, spans = [], set(() if wanted is None else wanted.tolist()), []
     for scene in found.scenes:
         stamps = found.stamps(scene)
@@ -218,24 +212,24 @@ def predict(
     return table_like(detections, parts or [found.named("", PredictedTracks.empty(0.0, ahead).table_columns(modes))])
 
 
-def _tell_default(settings: TrackerSettings | None, like: Like | None) -> None:
+def _tell_default(settings: TrackerSettings | Like | None) -> None:
     """Warn, at the caller's caller, of a default that fits no table."""
-    if like is None and isinstance(settings, TrackerSettings) and settings.min_hits == TrackerSettings().min_hits:
+    if isinstance(settings, TrackerSettings) and settings.min_hits == TrackerSettings().min_hits:
         what = f"settings: min_hits is at its default, {settings.min_hits}"
         what = f"{what}, where tables without settings have {plain_settings().min_hits}"
-        warnings.warn(f"{what}: like='plain' keeps what fits them for all that settings leave out", stacklevel=3)
+        warnings.warn(f"{what}: change what saga_fg.tracking.plain_settings() gives", stacklevel=3)
 
 
 class TableScenes(NamedTuple):
-    """The scenes of a table of detections, and how to track them; is_named: they have a column `scene`; like: whose
-    settings fit them."""
+    """The scenes of a table of detections, and how to track them; is_named: they have a column `scene`; dense: the
+    settings are those of `dense_traffic_settings`."""
 
     scenes: list[Scene]
     settings: TrackerSettings
     sensors: Mapping[str, Sensor]
     is_named: bool
     method: Method
-    like: Like
+    dense: bool
 
     def new_tracker(self) -> Tracker | GreedyTracker:
         """Return a tracker for one of them."""
@@ -256,39 +250,33 @@ class TableScenes(NamedTuple):
 def read_scenes(
     detections: Table,
     how: TableImport | None,
-    settings: TrackerSettings | None,
+    settings: TrackerSettings | Like | None,
     sensors: Mapping[str, Sensor] | None,
-    like: Like | None,
     method: Method,
-    estimator: str | None,
 ) -> TableScenes:
     """Read a table; arguments as of `track`. Settings that are left out are those that fit its first scene.
 
     Warns of those for dense traffic and of what is doubtful, at the caller's caller; raises as `tell`.
     """
-    for name, value, known in (("method", method, get_args(Method)), ("like", like or "plain", get_args(Like))):
-        if value not in known:
-            raise InputError(f"{name}: expected one of {', '.join(known)}, got {value!r}")
-    if settings is not None:
+    if method not in get_args(Method):
+        raise InputError(f"method: expected one of {', '.join(get_args(Method))}, got {method!r}")
+    if isinstance(settings, str) and settings not in get_args(Like):
+        raise InputError(f"settings: expected {' or '.join(get_args(Like))} or TrackerSettings, got {settings!r}")
+    if not isinstance(settings, str | None):
         require_type("settings", settings, TrackerSettings)
-    if method == "centerpoint" and (settings, estimator) != (None, None):
-        raise InputError("settings, estimator: expected None with method='centerpoint', which has its own")
+    if method == "centerpoint" and settings is not None:
+        raise InputError("settings: expected None with method='centerpoint', which has its own")
     sensors = UNKNOWN_SENSORS if sensors is None else checked_sensors(sensors)
     raw = raw_table(detections, how)
     scenes = scenes_of(raw)
-    undecided = settings is None and like is None and method != "centerpoint"
+    undecided = settings is None and method != "centerpoint"
     why = seems_dense_traffic(scenes[0].frames) if scenes and undecided else ""
     if why:
-        warnings.warn(f"settings for dense traffic: {why}; like='plain' takes others", stacklevel=3)
-    given, like = like is not None, like or ("dense" if why else "plain")
-    fits, usual = dense_traffic_settings() if like == "dense" else plain_settings(), TrackerSettings()
-    if settings is None:
-        settings = fits
-    elif given:
-        kept = [each.name for each in fields(usual) if getattr(settings, each.name) == getattr(usual, each.name)]
-        settings = replace(settings, **{name: getattr(fits, name) for name in kept})
-    if estimator is not None:
-        settings = replace(settings, estimator=estimator)
+        warnings.warn(f"settings for dense traffic: {why}; settings='plain' takes others", stacklevel=3)
+        settings = "dense"
+    dense = settings == "dense"
+    if not isinstance(settings, TrackerSettings):
+        settings = dense_traffic_settings() if dense else plain_settings()
     settings = settings.of_method(method)
     frames = [frame for scene in scenes for frame in scene.frames]
     labels = {name for frame in frames for name in frame.detections.boxes.label.tolist()}
@@ -296,7 +284,7 @@ def read_scenes(
     findings = [one for scene in scenes for one in scene.findings or () if one.kind != "scores" or not logits]
     rules = idle_rules(acting_classes(settings.edges), labels - {UNNAMED})
     tell([*findings, *raw.how.judged([] if rules is None else [rules], raw.found.names, raw.within)], raw, depth=4)
-    return TableScenes(scenes, settings, sensors, "scene" in raw.columns, method, like)
+    return TableScenes(scenes, settings, sensors, "scene" in raw.columns, method, dense)
 
 
 D = TypeVar("D")

@@ -505,7 +505,7 @@ def test_labels_of_dense_traffic_begin_with_its_settings_as_those_of_a_program_d
         found[like] = (tmp_path / f"labels-{like}" / "labels.csv").read_text()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            boxes = labelled(pandas.read_csv(table), like=like).boxes()
+            boxes = labelled(pandas.read_csv(table), like).boxes()
         assert boxes.x.to_numpy() == pytest.approx(pandas.read_csv(io.StringIO(found[like])).x.to_numpy(), abs=1e-3)
     assert found["dense"] == found[None] != found["plain"]
     truth = tmp_path / "truth.csv"

@@ -1,5 +1,6 @@
 """`saga_fg.evaluate` and `saga_fg.view`: as the command says, for tables of pandas, Polars and Arrow."""
 
+import dataclasses
 import json
 import re
 import warnings
@@ -10,6 +11,7 @@ import pytest
 import saga_fg
 from saga_fg import InputError
 from saga_fg.tables.column_names import TableImport
+from saga_fg.tracking import plain_settings
 from tests.pipelines.command import done
 
 pd = pytest.importorskip("pandas")
@@ -58,13 +60,16 @@ def test_methods_and_estimators_are_those_of_the_command(options, tmp_path):
         "--output",
         result,
     )
-    found = saga_fg.track(DETECTIONS, **options)
+    by_name = dict(options)
+    if "estimator" in options:
+        by_name = {"settings": dataclasses.replace(plain_settings(), **options)}
+    found = saga_fg.track(DETECTIONS, **by_name)
     expected = pd.read_csv(result)
     pd.testing.assert_frame_equal(
         found[["timestamp", "id", "x", "y"]], expected[["timestamp", "id", "x", "y"]], atol=1e-3
     )
-    with pytest.raises(InputError, match="settings, estimator: expected None with method='centerpoint'"):
-        saga_fg.track(DETECTIONS, method="centerpoint", estimator="isam2")
+    with pytest.raises(InputError, match="settings: expected None with method='centerpoint'"):
+        saga_fg.track(DETECTIONS, "plain", method="centerpoint")
 
 
 @pytest.mark.parametrize("kind", ["polars", "pyarrow"])

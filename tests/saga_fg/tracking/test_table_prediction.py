@@ -1,6 +1,7 @@
 """`saga_fg.predict`: where the tracks of a table will be, as the textbook says and as the edges do."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import saga_fg
 from saga_fg import ConstantVelocity, InputError, Sensor, TableImport, Tracker, TrackerSettings
 from saga_fg.estimators.reference import Gaussian, kalman_predict, kalman_update
 from saga_fg.model import NoiseModel
-from saga_fg.tracking import ClassSettings
+from saga_fg.tracking import ClassSettings, plain_settings
 
 pd = pytest.importorskip("pandas", reason="pandas comes with the extra pandas")
 SENSORS = {"default": Sensor(noise={"default": NoiseModel(position=0.2)})}
@@ -163,7 +164,7 @@ def test_what_cannot_be_predicted_is_named(subtests):
         ({"how": {"columns": {"x": "east"}}}, "how: expected TableImport, got dict"),
         ({"method": "centerpoint"}, "method: expected saga or kf, centerpoint predicts nothing"),
         ({"method": "sage"}, "method: expected one of saga, kf, centerpoint, got 'sage'"),
-        ({"like": "thin"}, "like: expected one of plain, dense, got 'thin'"),
+        ({"settings": "thin"}, "settings: expected plain or dense or TrackerSettings, got 'thin'"),
     ]:
         with subtests.test(message), pytest.raises(InputError, match=re.escape(message)):
             saga_fg.predict(rows, **arguments)
@@ -182,11 +183,9 @@ def test_what_cannot_be_predicted_is_named(subtests):
 
 def test_settings_keep_what_fits_tables_where_they_say_nothing():
     rows, few = traffic(1.0), TrackerSettings(edges=())
-    with pytest.warns(
-        UserWarning, match="settings: min_hits is at its default, 1, where .* have 2: like='plain' keeps"
-    ):
+    with pytest.warns(UserWarning, match="settings: min_hits is at its default, 1, where .* have 2: change what"):
         hasty = saga_fg.track(rows, settings=few)
-    kept = saga_fg.track(rows, settings=few, like="plain")
+    kept = saga_fg.track(rows, settings=replace(plain_settings(), edges=()))
     pd.testing.assert_frame_equal(kept, saga_fg.track(rows, settings=TrackerSettings(edges=(), min_hits=2)))
     assert len(hasty) > len(kept)
 
