@@ -430,16 +430,21 @@ class TableImport(Settings):
         entries = {each.name: getattr(mended, each.name) for each in fields(Mend) if getattr(mend, each.name)}
         return option_text(entries, within)
 
-    def _mends(self, mend: Mend) -> bool:
-        """False where a suspicion stays although these options say all that mends it."""
-        return any(getattr(self.mended(mend, {}), field.name) != getattr(self, field.name) for field in fields(Mend))
+    def _possible(self, mend: Mend, names: Mapping[str, str]) -> Mend | None:
+        """What mends a suspicion: without speeds that are read as m/s already; None where all of it is said here."""
+        by_name = (meaning(names.get("vx", "")) or ("", None))[1]
+        if mend.units.get("speed") == "m/s" and self.unit("vx", by_name) in (None, "m/s"):
+            units = {name: unit for name, unit in mend.units.items() if name != "speed"}
+            mend = replace(mend, units=units, columns={**mend.columns, "vx": "", "vy": ""})
+        mended = self.mended(mend, {})
+        return mend if any(getattr(mended, each.name) != getattr(self, each.name) for each in fields(Mend)) else None
 
     def judged(
         self, findings: Iterable[Finding], names: Mapping[str, str], within: str = COMMAND
     ) -> tuple[Finding, ...]:
         """The findings, each with the options that mend it, as of `option_for`, and whether the table contradicts how
         it is read."""
-        judged = [one if one.mend is None or self._mends(one.mend) else replace(one, mend=None) for one in findings]
+        judged = [one if one.mend is None else replace(one, mend=self._possible(one.mend, names)) for one in findings]
         judged = [replace(one, stops=not self.as_given and one.contradicts) for one in judged]
         together = reduce(or_, (one.mend for one in judged if one.stops and one.mend is not None), Mend())
         mends = [together if one.stops else one.mend for one in judged]

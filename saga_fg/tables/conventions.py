@@ -269,41 +269,90 @@ def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | Non
     return headings_in_degrees(sample.yaw) if of_objects is None else None
 
 
-_STILL = 0.5  # m/s between frames, below which an object may stand
+_STILL, _NEARLY_STILL = 0.5, 1.0  # m/s between frames, below which an object may stand
 _SPEEDS = {"km/h": 3.6, "ft/s": 3.281, "mph": 2.237}
+_WITHOUT = Mend(columns={"vx": "", "vy": ""})
 
 
-def speeds_against_motion(velocity: FloatArray, motion: FloatArray) -> Finding | None:
-    """Measured velocities (n, 2) which are those between frames (n, 2) in another unit than m/s, or are none.
+def velocities_against_motion(
+    velocity: FloatArray, motion: FloatArray, ego: FloatArray | None = None, axes: FloatArray | None = None
+) -> Finding | None:
+    """Measured velocities (n, 2) which are those between frames (n, 2) in another unit or sense, or are none.
+
+    ego   (n, 2) velocity of the vehicle over ground, to which they may be relative
+    axes  (n,) turn of the axes along which they may be instead, rad
+    """
+    known = np.isfinite(motion).all(axis=1) & np.isfinite(velocity).all(axis=1)
+    if known.sum() < 2 * FEWEST:
+        return None
+    velocity, motion, squares = velocity[known], motion[known], (velocity[known] ** 2).sum(axis=1)
+    clear = np.hypot(*motion.T) > _MOVES
+    if clear.sum() >= 2 * FEWEST and share(squares[clear] < 1e-18) > 0.9:
+        what = "measured velocities are zero of objects that move"
+        return Finding("speeds", what, "expected those over ground, or none", _WITHOUT)
+    moves = clear | (squares > (2 * _WALKS) ** 2)
+    if moves.sum() < 2 * FEWEST:
+        return None
+    meant = {
+        "are exchanged": (velocity[:, ::-1], Mend(columns={"vx": "vy", "vy": "vx"})),
+        "are reversed": (-velocity, _WITHOUT),
+        "are mirrored": (velocity * [1.0, -1.0], _WITHOUT),
+    }
+    if ego is not None:
+        meant["are relative to the vehicle"] = velocity + ego[known], _WITHOUT
+    if axes is not None:
+        meant["are along other axes than positions"] = _turned(velocity, axes[known]), _WITHOUT
+    apart = {name: _middle_distance(each[moves], motion[moves]) for name, (each, _) in meant.items()}
+    least = min(apart.values())
+    scaled = min(_middle_distance(velocity[moves] * k, motion[moves]) for f in _SPEEDS.values() for k in (f, 1 / f))
+    now, usual = (_middle_distance(each[moves], motion[moves]) for each in (velocity, 0 * motion))
+    if now > max(1.0, 0.3 * usual) and least < 0.35 * now and least < scaled:
+        name = next(name for name in meant if apart[name] < least + 0.1)
+        what = f"measured velocities vx, vy look as if they {name}: half of them differ from the motion between frames"
+        return Finding("speeds", f"{what} by {now:.2g} m/s and more", "expected those over ground", meant[name][1])
+    return _speeds_in_another_unit(velocity, motion, squares)
+
+
+def _middle_distance(a: FloatArray, b: FloatArray) -> float:
+    apart = np.hypot(*(a - b).T)
+    return float(np.median(apart[np.isfinite(apart)])) if np.isfinite(apart).mean() > 0.5 else np.inf
+
+
+def _speeds_in_another_unit(velocity: FloatArray, motion: FloatArray, squares: FloatArray) -> Finding | None:
+    """Velocities (n, 2) as large as those between frames (n, 2) in another unit than m/s, or those divided by one.
 
     Fast objects tell the factor. Where all are slow, the mean squares of all velocities v do, less the noise of those
     that stay where they are: f = sum(|v|^2 - noise) / sum(v m), with m between frames.
     """
-    known = np.isfinite(motion).all(axis=1) & np.isfinite(velocity).all(axis=1)
-    moves = known & (np.hypot(*motion.T) > _MOVES)
-    if moves.sum() >= 2 * FEWEST and share(np.abs(velocity[moves]).max(axis=1) < 1e-9) > 0.9:
-        what, mend = "measured velocities are zero of objects that move", Mend(columns={"vx": "", "vy": ""})
-        return Finding("speeds", what, "expected those over ground, or none", mend)
-    moves = known & (np.hypot(*velocity.T) > 2 * _WALKS)
-    if moves.sum() < 2 * FEWEST:
-        return None
-    measured, moved = velocity[moves], motion[moves]
-    weight = (measured**2).sum(axis=1)
-    ratio = (measured * moved).sum(axis=1) / weight
-    order = np.argsort(ratio)
-    middle = order[np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())]  # fast objects tell more
-    found = [(1 / max(ratio[middle], 1e-3), list(_SPEEDS))]
-    still, squares = known & (np.hypot(*motion.T) < _STILL), (velocity**2).sum(axis=1)
-    if still.sum() >= FEWEST:
-        noise = np.median(squares[still]) / np.log(2)
-        factor = (squares[known] - noise).sum() / max((velocity[known] * motion[known]).sum(), 1e-3)
-        found.append((max(factor, 1e-3), ["km/h", "mph"]))  # too rough for more
-    for factor, units in found:
+    products, ways = (velocity * motion).sum(axis=1), (motion**2).sum(axis=1)
+    fast, clear = squares > (2 * _WALKS) ** 2, ways > _MOVES**2
+    found: list[tuple[float, list[str]]] = []
+    if fast.sum() >= 2 * FEWEST:
+        found.append((1 / max(_weighted_median(products[fast] / squares[fast], squares[fast]), 1e-3), list(_SPEEDS)))
+        still = np.sqrt(ways) < _STILL
+        if still.sum() >= FEWEST:
+            noise = np.median(squares[still]) / np.log(2)
+            found.append((max((squares - noise).sum() / max(products.sum(), 1e-3), 1e-3), ["km/h", "mph"]))
+    for factor, units in found:  # the second is too rough for more units
         unit = min(units, key=lambda unit: abs(np.log(factor / _SPEEDS[unit])))
         if 0.85 < factor / _SPEEDS[unit] < 1.15:
             what = f"measured velocities are {factor:.2g} times as large as objects move from frame to frame"
             return Finding("speeds", f"{what}: they look like {unit}", "expected m/s", Mend(units={"speed": unit}))
-    return None
+    if clear.sum() < 2 * FEWEST:
+        return None
+    ratio = products[clear] / ways[clear]
+    factor = _weighted_median(ratio, ways[clear])
+    unit = min(_SPEEDS, key=lambda unit: abs(np.log(max(factor, 1e-3) * _SPEEDS[unit])))
+    if not 0.92 < factor * _SPEEDS[unit] < 1.08 or share(np.abs(ratio - factor) < 0.3 * factor) < 0.6:
+        return None
+    what = f"measured velocities vx, vy are {factor:.2g} times as large as objects move from frame to frame"
+    what += f": they look like m/s taken for {unit}, or divided twice"
+    return Finding("speeds", what, "expected m/s", Mend(units={"speed": "m/s"}))
+
+
+def _weighted_median(values: FloatArray, weight: FloatArray) -> float:
+    order = np.argsort(values)
+    return float(values[order[np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())]])
 
 
 def camera_axes(position: FloatArray) -> Finding | None:
@@ -344,14 +393,15 @@ def _fits_better(sample: Sample, rows: IntArray, read: FloatArray, other: FloatA
     motions = [sample.motion(read), sample.motion(other)]
     own = int(turn is None)  # the one of them that is of the vehicle's frame
     motions[own] = _turned(motions[own], -sample.ego[1])
-    for apart_of, least in ((_velocity_apart, 0.3), (_heading_apart, 0.12)):
+    for apart_of, least in ((_heading_apart, 0.12), (_velocity_apart, 0.3)):
         apart = [apart_of(sample, motion, rows) for motion in motions]
-        if min(map(len, apart)) >= 2 * FEWEST:
+        velocities_decide = own == 1 or _far_from_origin(other[rows], sample.ego[0][rows])
+        if min(map(len, apart)) >= 2 * FEWEST and (apart_of is _heading_apart or velocities_decide):
             one, another = (float(np.median(each)) for each in apart)
             if one > least and another < 0.4 * one:
                 return True
         if len(apart[0]) >= 2 * FEWEST and np.median(apart[0]) < least:
-            return False
+            return apart_of is _velocity_apart and own == 1 and _slide_past(sample, rows)
     return own == 1 and _stay_nearer(sample, rows, read, other)  # traffic that goes along stays in the vehicle's frame
 
 
@@ -374,6 +424,25 @@ def _heading_apart(sample: Sample, motion: FloatArray, rows: IntArray) -> FloatA
     least = np.where(sample.walks, _WALKS, _MOVES)
     moves = rows[(np.hypot(*motion.T) > least)[rows] & np.isfinite(sample.yaw)[rows] & ~sample.stands[rows]]
     return np.asarray(np.abs(wrap_angle(sample.yaw[moves] - np.arctan2(motion[moves, 1], motion[moves, 0]))))
+
+
+def _far_from_origin(position: FloatArray, ego: FloatArray) -> bool:
+    """True if positions (n, 2) are about the vehicle at places (n, 2), and not about the origin.
+
+    Velocities cannot tell those in the world from those of the vehicle's frame that are relative to it.
+    """
+    about, from_ego = (float(np.median(np.hypot(*each.T))) for each in (position, position - ego))
+    return from_ego < 0.5 * about
+
+
+def _slide_past(sample: Sample, rows: IntArray) -> bool:
+    """True if objects move as what stands does, seen from the vehicle, and hardly any stands as it is read."""
+    motion = sample.motion(sample.boxes.position[:, :2])[rows]
+    driven = np.hypot(*sample.ego_motion[sample.frame[rows]].T)
+    known = np.isfinite(motion).all(axis=1) & (driven > _MOVES)
+    motion, driven = motion[known], driven[known]
+    slides = share(np.hypot(motion[:, 0] + driven, motion[:, 1]) < _NEARLY_STILL)
+    return len(motion) >= 2 * FEWEST and slides > 0.3 and share(np.hypot(*motion.T) < _NEARLY_STILL) < 0.05
 
 
 def _stay_nearer(sample: Sample, rows: IntArray, given: FloatArray, placed: FloatArray) -> bool:
@@ -423,10 +492,16 @@ def findings_of(sample: Sample, logits: Callable[[str], bool] = lambda sensor: F
     turned = headings_in_degrees(sample.ego_yaw, "ego_yaw")  # places in the world depend on it
     frame = camera_axes(boxes.position) or turned or frame_taken_for_another(sample)
     if frame is None:
-        known = np.isfinite(boxes.velocity).any(axis=1) & (np.hypot(*boxes.velocity.T) > _WALKS)
-        motion = np.where(known[:, None], boxes.velocity, sample.own_motion)
-        motion[sample.stands] = np.nan
-        speeds = speeds_against_motion(boxes.velocity, sample.own_motion) or far_too_fast(label, boxes.velocity)
+        motion, measured = sample.own_motion, boxes.velocity
+        of_ego, turn = sample.coordinates[sample.frame] == "ego", sample.ego[1]
+        ego = sample.ego_motion[sample.frame]
+        ego = np.where(of_ego[:, None], _turned(ego, -turn), ego)
+        speeds = velocities_against_motion(measured, motion, ego, np.where(of_ego, -turn, turn))
+        speeds = speeds or far_too_fast(label, measured)
+        if speeds is None or (speeds.mend is not None and speeds.mend.units):
+            known = np.isfinite(measured).any(axis=1) & (np.hypot(*measured.T) > _WALKS)
+            motion = np.where(known[:, None], measured, motion)
+        motion = np.where(sample.stands[:, None], np.nan, motion)
         found += [headings_against_motion(sample, motion), speeds]
     else:
         found += [frame, headings_in_degrees(sample.yaw), far_too_fast(label, boxes.velocity)]

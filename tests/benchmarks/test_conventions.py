@@ -48,6 +48,31 @@ def test_headings_of_the_world_beside_positions_of_the_vehicles_frame_are_named(
         refuse_contradictions(read(ego.assign(yaw=world.yaw)).findings)
 
 
+def relative(made):
+    speed = 10 * np.hypot(*np.gradient(made.drop_duplicates("timestamp")[["ego_x", "ego_y"]].to_numpy(), axis=0).T)
+    driven = speed[np.unique(made.timestamp, return_inverse=True)[1]]
+    return made.assign(vx=made.vx - driven * np.cos(made.ego_yaw), vy=made.vy - driven * np.sin(made.ego_yaw))
+
+
+WRONG_VELOCITIES = {
+    "0.2": (lambda made: made.assign(vx=made.vx / 3.6, vy=made.vy / 3.6), "vx=,vy="),
+    "reversed": (lambda made: made.assign(vx=-made.vx, vy=-made.vy), "vx=,vy="),
+    "exchanged": (lambda made: made.assign(vx=made.vy, vy=made.vx), "vx=vy,vy=vx"),
+    "relative to the vehicle": (relative, "vx=,vy="),
+}
+
+
+@pytest.mark.parametrize("kind", ["queue", "motorway"])
+@pytest.mark.parametrize("wrong", WRONG_VELOCITIES)
+def test_velocities_that_contradict_the_motion_are_named_as_such(kind, wrong):
+    change, option = WRONG_VELOCITIES[wrong]
+    right = table(kind, np.random.default_rng([6007, *map(ord, kind)]), True)
+    of_ego = _of_ego(change(right) if wrong.startswith("relative") else right)
+    for made in (change(right), (of_ego if wrong.startswith("relative") else change(of_ego)).assign(coordinates="ego")):
+        with pytest.raises(InputError, match=rf"measured velocities vx, vy .*{wrong}.*--columns {option};"):
+            refuse_contradictions(read(made).findings)
+
+
 def placed(scene):
     """Positions, headings and velocities in the world."""
     boxes = [

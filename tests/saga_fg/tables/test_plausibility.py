@@ -12,7 +12,7 @@ from saga_fg.tables.conventions import (
     fitting_convention,
     frame_taken_for_another,
     headings_in_degrees,
-    speeds_against_motion,
+    velocities_against_motion,
     velocities_between_frames,
 )
 from saga_fg.tables.plausibility import (
@@ -111,20 +111,29 @@ def test_units_that_mend_are_those_of_how_a_table_is_read():
     assert of_column.unit("ego_yaw", None) is None
 
 
-def test_speeds_against_motion(subtests):
+def test_measured_velocities_against_motion(subtests):
     motion = RNG.normal(0, 6, (80, 2))
     for factor, found in [(1.0, None), (3.6, "km/h"), (2.237, "mph"), (3.281, "ft/s"), (0.5, None), (-3.6, None)]:
         with subtests.test(factor=factor):
             measured = factor * motion + RNG.normal(0, 0.3, motion.shape)
-            finding = speeds_against_motion(measured, motion + RNG.normal(0, 0.5, motion.shape))
+            finding = velocities_against_motion(measured, motion + RNG.normal(0, 0.5, motion.shape))
             assert option(finding) == (None if found is None else f"--units speed={found}")
-    assert option(speeds_against_motion(0 * motion, motion)) == "--columns vx=,vy="
+    for factor in (1 / 3.6, 1 / 2.237):
+        finding = velocities_against_motion(factor * motion + RNG.normal(0, 0.1, motion.shape), motion)
+        assert option(finding) == "--columns vx=,vy="
+        for how, names in [(TableImport(units={"speed": "km/h"}), {}), (TableImport(), {"vx": "vx_kmh"})]:
+            (judged,) = how.judged([finding], names)
+            assert judged.option == "--units speed=m/s"
+            assert judged.stops
+        (judged,) = TableImport(columns={"vx": "", "vy": ""}).judged([finding], {})
+        assert not judged.stops
+    assert option(velocities_against_motion(0 * motion, motion)) == "--columns vx=,vy="
     slow = np.concatenate([np.zeros((600, 2)), np.tile([1.3, 0.0], (200, 1))])  # who walks past parked cars
     walked, measured = (slow + RNG.normal(0, 0.3, slow.shape) for _ in range(2))
-    assert option(speeds_against_motion(3.6 * measured, walked)) == "--units speed=km/h"
-    assert speeds_against_motion(measured, walked) is None
-    assert speeds_against_motion(3.6 * motion[:20], motion[:20]) is None
-    assert speeds_against_motion(3.6 * motion, np.full(motion.shape, np.nan)) is None
+    assert option(velocities_against_motion(3.6 * measured, walked)) == "--units speed=km/h"
+    assert velocities_against_motion(measured, walked) is None
+    assert velocities_against_motion(3.6 * motion[:20], motion[:20]) is None
+    assert velocities_against_motion(3.6 * motion, np.full(motion.shape, np.nan)) is None
 
 
 def test_camera_axes(subtests):
