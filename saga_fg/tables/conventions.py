@@ -32,6 +32,7 @@ MIN_STEP = 1e-6  # s between two frames, of which a velocity can be told
 SPAN = 0.5  # s of motion, so that the noise of places hardly matters
 _MOVES, _WALKS = 2.0, 0.8  # m/s, from which the direction of motion tells the heading, of vehicles and of people
 _NEARLY = "nearly "  # before a unit that explains headings better, which are not far off as they are
+_NEARLY_STILL = 0.8  # m/s between motions that may be the same
 _ASTRAY, _OFF = 0.5, 0.2  # rad between them: of one object, and of half of them
 _AWAY = 100.0  # m from the origin, from which what surrounds the vehicle does not surround the origin
 _DEEP, _FLAT, _NEAR = 8.0, 3.0, 40.0  # m: spread of depths, spread of heights, and the nearest depth before a camera
@@ -177,6 +178,17 @@ def velocities_between_frames(time: FloatArray, label: StrArray, position: Float
     return found
 
 
+def shared_motion(time: FloatArray, motion: FloatArray) -> FloatArray:
+    """The motion (n, 2) that most objects share in the second of each row, by motions (n, 2); NaN where unknown."""
+    shared, known = np.full(motion.shape, np.nan), np.isfinite(motion).all(axis=1)
+    second = np.floor(time)
+    for now in np.unique(second[known]).tolist():
+        rows = np.flatnonzero(known & (second == now))[:MAX_FRAMES]
+        near = np.hypot(*(motion[rows, None] - motion[None, rows]).transpose(2, 0, 1)) < _NEARLY_STILL
+        shared[second == now] = motion[rows[near[near.sum(axis=1).argmax()]]].mean(axis=0)
+    return shared
+
+
 def headings_in_degrees(yaw: FloatArray, column: Literal["angle", "ego_yaw"] = "angle") -> Finding | None:
     """Headings (n,) as they were given, many of them beyond a full turn of 2 pi; column: of all, or of the vehicle."""
     known = np.abs(yaw[np.isfinite(yaw)])
@@ -269,7 +281,7 @@ def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | Non
     return headings_in_degrees(sample.yaw) if of_objects is None else None
 
 
-_STILL, _NEARLY_STILL = 0.5, 1.0  # m/s between frames, below which an object may stand
+_STILL = 0.5  # m/s between frames, below which an object may stand
 _SPEEDS = {"km/h": 3.6, "ft/s": 3.281, "mph": 2.237}
 _WITHOUT = Mend(columns={"vx": "", "vy": ""})
 
@@ -306,7 +318,7 @@ def velocities_against_motion(
     least = min(apart.values())
     scaled = min(_middle_distance(velocity[moves] * k, motion[moves]) for f in _SPEEDS.values() for k in (f, 1 / f))
     now, usual = (_middle_distance(each[moves], motion[moves]) for each in (velocity, 0 * motion))
-    if now > max(1.0, 0.3 * usual) and least < 0.35 * now and least < scaled:
+    if now > max(1.0, 0.3 * usual) and least < 0.35 * now and least + 0.1 < scaled:
         name = next(name for name in meant if apart[name] < least + 0.1)
         what = f"measured velocities vx, vy look as if they {name}: half of them differ from the motion between frames"
         return Finding("speeds", f"{what} by {now:.2g} m/s and more", "expected those over ground", meant[name][1])
@@ -426,6 +438,31 @@ def _heading_apart(sample: Sample, motion: FloatArray, rows: IntArray) -> FloatA
     return np.asarray(np.abs(wrap_angle(sample.yaw[moves] - np.arctan2(motion[moves, 1], motion[moves, 0]))))
 
 
+_CARRIED = Finding(
+    "frame",
+    "positions look like coordinates of a vehicle that moves, without its pose: what they share of their motion is its",
+    "expected world coordinates, or ego_x, ego_y, ego_yaw and coordinates: ego",
+    Mend(coordinates="ego"),
+)
+
+
+def _share_motion_of_vehicle(sample: Sample) -> bool:
+    """True if measured velocities, or headings of vehicles, fit motion less what most objects share, and not motion."""
+    motion, velocity, time = sample.own_motion, sample.boxes.velocity, sample.time[sample.frame]
+    rows = np.flatnonzero(np.isnan(sample.ego[1]) & (sample.coordinates == "world").all())
+    driven = np.where(sample.walks[:, None], np.nan, motion)
+    for apart_of, moved, of, least in (
+        (_velocity_apart, motion, motion - velocity, 1.0),
+        (_heading_apart, driven, driven, _ASTRAY),
+    ):
+        apart = [apart_of(sample, each, rows) for each in (moved, moved - shared_motion(time, of))]
+        if min(map(len, apart)) >= 2 * FEWEST:
+            one, another = (float(np.median(each)) for each in apart)
+            if one > least and another < 0.45 * one:
+                return True
+    return False
+
+
 def _far_from_origin(position: FloatArray, ego: FloatArray) -> bool:
     """True if positions (n, 2) are about the vehicle at places (n, 2), and not about the origin.
 
@@ -502,7 +539,10 @@ def findings_of(sample: Sample, logits: Callable[[str], bool] = lambda sensor: F
             known = np.isfinite(measured).any(axis=1) & (np.hypot(*measured.T) > _WALKS)
             motion = np.where(known[:, None], measured, motion)
         motion = np.where(sample.stands[:, None], np.nan, motion)
-        found += [headings_against_motion(sample, motion), speeds]
+        headings = headings_against_motion(sample, motion)
+        named = any(each is not None and each.mend is not None and each.mend.units for each in (headings, speeds))
+        carried = speeds is None and not named and _share_motion_of_vehicle(sample)
+        found += [_CARRIED] if carried else [headings, speeds]
     else:
         found += [frame, headings_in_degrees(sample.yaw), far_too_fast(label, boxes.velocity)]
     return [finding for finding in found if finding is not None]

@@ -73,6 +73,15 @@ def test_velocities_that_contradict_the_motion_are_named_as_such(kind, wrong):
             refuse_contradictions(read(made).findings)
 
 
+@pytest.mark.parametrize(("kind", "speeds"), [("crowd", True), ("crossing", True), ("parked street", False)])
+def test_rows_of_the_vehicles_frame_without_its_pose_are_named(kind, speeds):
+    world = table(kind, np.random.default_rng([88112, *map(ord, kind)]), speeds)
+    pose = ["ego_x", "ego_y", "ego_yaw"]
+    assert not read(world.drop(columns=pose)).findings
+    with pytest.raises(InputError, match=r"coordinates of a vehicle that moves, without its pose.*--coordinates ego"):
+        refuse_contradictions(read(_of_ego(world).drop(columns=pose)).findings)
+
+
 def placed(scene):
     """Positions, headings and velocities in the world."""
     boxes = [
