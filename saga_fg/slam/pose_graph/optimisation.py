@@ -41,7 +41,6 @@ import gtsam
 import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
-from scipy.stats import chi2
 
 from factors import (
     FactorError,
@@ -57,6 +56,7 @@ from factors import (
 )
 from saga_fg.errors import InputError
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, checked
+from saga_fg.numerics.geometry import chi_square_quantile
 from saga_fg.slam.pose_graph.certificate import ChordalMinimum, chordal_minimum
 from saga_fg.slam.pose_graph.chordal import chordal_poses, factorised
 from saga_fg.slam.pose_graph.graph import PoseGraph, trusted
@@ -310,7 +310,7 @@ class _Problem:
 
     @property
     def gate(self) -> float:
-        return float(chi2.ppf(PROBABILITY, self.k))
+        return chi_square_quantile(PROBABILITY, self.k)
 
     def distances(self, values: gtsam.Values) -> FloatArray:
         """Distances (M,) of the residuals, standard deviations."""
@@ -390,9 +390,9 @@ def _snooped(
     for _ in range(_MAX_ROUNDS):
         values = problem.solved(values, kept)
         squares, inside = _judged(problem, values, rows, kept), kept[rows]
-        gate = float(chi2.ppf(_CERTAIN, problem.k))
+        gate = chi_square_quantile(_CERTAIN, problem.k)
         if inside.sum() >= _FEWEST:
-            k = float(np.median(squares[inside])) / float(chi2.median(problem.k))
+            k = float(np.median(squares[inside])) / chi_square_quantile(0.5, problem.k)
             gate = min(gate, _TAILS * k * problem.gate)
         outlying, fitting = inside & (squares > gate), ~inside & (squares <= gate)
         if outlying.any():
