@@ -1,11 +1,23 @@
-"""Fixtures of commands: logging as it was before."""
+"""Fixtures of commands: logging as it was before, workers that start at once."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import pytest
+
+from pipelines.scale_out import pools
+from tests.pipelines import forked
+
+
+@pytest.fixture(autouse=True, scope="session")
+def workers_are_forked() -> Iterator[None]:
+    """Those of commands in this process: what they import they have already."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pools, "multiprocessing", SimpleNamespace(get_context=lambda _: forked.context()))
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -11,7 +11,7 @@ from typing import Any
 
 from pipelines.serving import Address, StreamClient, parse_address
 from pipelines.serving.messages import encode
-from tests.pipelines.command import COMMAND
+from tests.pipelines.forked import Command, listening
 
 
 def frame(seq: int, sensor: str = "sensor") -> bytes:
@@ -21,12 +21,16 @@ def frame(seq: int, sensor: str = "sensor") -> bytes:
 
 @contextmanager
 def serving(
-    *arguments: str, command: Sequence[str] = (*COMMAND, "serve"), before: Callable[[], None] | None = None
-) -> Iterator[tuple[Address, subprocess.Popen[str]]]:
-    """A service and its address; `before` runs in its process first."""
-    with subprocess.Popen([*command, *arguments], stderr=subprocess.PIPE, text=True, preexec_fn=before) as server:
+    *arguments: str, command: Sequence[str] | None = None, before: Callable[[], object] | None = None
+) -> Iterator[tuple[Address, subprocess.Popen[str] | Command]]:
+    """A service, or a command of its own, and its address; `before` runs in its process first."""
+    if command is None:
+        server: subprocess.Popen[str] | Command = listening(["serve", *arguments], before)
+    else:
+        server = subprocess.Popen([*command, *arguments], stderr=subprocess.PIPE, text=True)
+    assert server.stderr is not None
+    with server.stderr:
         try:
-            assert server.stderr is not None
             line = server.stderr.readline().strip()
             while line.startswith(("WARNING: compiling kernels", "compiling kernels", "going on from")):
                 line = server.stderr.readline().strip()
@@ -34,6 +38,7 @@ def serving(
             yield parse_address(line.removeprefix("listening at ")), server
         finally:
             server.kill()
+            server.wait()
 
 
 def limits(folder: Path, **settings: float) -> tuple[str, str]:

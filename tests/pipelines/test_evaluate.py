@@ -220,7 +220,7 @@ def test_the_command_prints_the_table(tmp_path, monkeypatch):
 # The direction of the demonstration's comparison, on fixed seeds: `saga` is at least as good in every column
 
 LENGTH = 8.0  # s
-SEEDS = range(6)
+SEEDS = range(3)
 
 
 @pytest.fixture(scope="module")
@@ -239,4 +239,4 @@ def test_saga_is_at_least_as_good_in_every_column(metrics, other):
     assert saga.carried.rmse <= baseline.carried.rmse
     assert saga.velocity.rmse <= 1.01 * baseline.velocity.rmse  # as good, to a hundredth
     assert saga.position.median <= baseline.position.median
-    assert saga.position.rmse <= 1.05 * baseline.position.rmse  # one wrong pair in six short scenes is 5 %
+    assert saga.position.rmse <= 1.05 * baseline.position.rmse  # one wrong pair in three short scenes is 5 %

@@ -37,6 +37,13 @@ def tracked(scene: Scene, method: Method) -> tuple[Tracks, ...]:
     return track_scene(scene, load_config("simulated").of_method(method).new_tracker(method)).tracks
 
 
+@pytest.fixture(scope="module")
+def usual(recording: tuple[Scene, tuple[Tracks, ...]]) -> tuple[float, int]:
+    """Figures of these tracks when they are refined."""
+    scene, tracks = recording
+    return figures(scene, refined(scene, given(scene, tracks)))
+
+
 def given(scene: Scene, tracks: tuple[Tracks, ...]) -> SceneResult:
     coasting = np.concatenate([each.coasting for each in tracks])
     return SceneResult(replace(scene, frames=()), SceneBoxes.of_tracks(tracks), coasting=coasting)
@@ -60,18 +67,20 @@ def figures(scene: Scene, tracks: tuple[Tracks, ...]) -> tuple[float, int]:
     return found.mota, found.switches
 
 
-def test_refined_tracks_are_better_than_those_given(recording: tuple[Scene, tuple[Tracks, ...]]) -> None:
-    scene, tracks = recording
-    (before, switched), (after, switches) = figures(scene, tracks), figures(scene, refined(scene, given(scene, tracks)))
+def test_refined_tracks_are_better_than_those_given(
+    recording: tuple[Scene, tuple[Tracks, ...]], usual: tuple[float, int]
+) -> None:
+    (before, switched), (after, switches) = figures(*recording), usual
     assert after > before + 0.02
     assert switches <= switched
 
 
-def test_fragments_are_joined_and_wrong_joins_are_cut(recording: tuple[Scene, tuple[Tracks, ...]]) -> None:
+def test_fragments_are_joined_and_wrong_joins_are_cut(
+    recording: tuple[Scene, tuple[Tracks, ...]], usual: tuple[float, int]
+) -> None:
     scene, tracks = recording
     result = given(scene, tracks)
     middle = len(scene) // 2
-    usual = refined(scene, result)
     broken = renamed(result, lambda name, frame: name if frame < middle else f"{name}b")
     ids, count = np.unique(result.found.id, return_counts=True)
     longest = ids[count > 60]
@@ -80,17 +89,18 @@ def test_fragments_are_joined_and_wrong_joins_are_cut(recording: tuple[Scene, tu
     crossed = renamed(result, lambda name, frame: turn.get(name, name) if frame >= middle else name)
     for wrong in (broken, crossed):
         mota, switches = figures(scene, refined(scene, wrong))
-        assert mota > figures(scene, usual)[0] - 0.01
-        assert switches <= figures(scene, usual)[1] + 1
+        assert mota > usual[0] - 0.01
+        assert switches <= usual[1] + 1
 
 
-def test_two_results_become_one_without_objects_twice(recording: tuple[Scene, tuple[Tracks, ...]]) -> None:
+def test_two_results_become_one_without_objects_twice(
+    recording: tuple[Scene, tuple[Tracks, ...]], usual: tuple[float, int]
+) -> None:
     scene, tracks = recording
     other = tracked(scene, "kf")
     both = refined(scene, given(scene, tracks), given(scene, other))
-    alone = refined(scene, given(scene, tracks))
-    assert figures(scene, both)[0] > figures(scene, alone)[0] - 0.01
-    assert sum(map(len, both)) < 1.2 * sum(map(len, alone))
+    assert figures(scene, both)[0] > usual[0] - 0.01
+    assert sum(map(len, both)) < 1.2 * sum(map(len, tracks))
 
 
 def test_what_a_table_marks_as_predicted_and_all_velocities_are_no_evidence(
@@ -108,7 +118,7 @@ def test_what_a_table_marks_as_predicted_and_all_velocities_are_no_evidence(
 
 def test_the_command_refines_a_table_alone_beside_a_dataset_and_in_workers(tmp_path: Path) -> None:
     tracks, short = tmp_path / "theirs.csv", tmp_path / "short.yaml"
-    short.write_text("duration: 3.0\n")
+    short.write_text("duration: 2.0\nwarm_up: 5.0\n")
     recordings = (*OPTIONS, "--simulator", short)
     for words in (
         ("track", *recordings, "--method", "centerpoint", "--output", tracks),

@@ -16,8 +16,9 @@ import pytest
 from pipelines.config import load_config
 from pipelines.serving import StreamClient, parse_address
 from saga_fg import Detection, Detections, Frame, InputError
-from tests.pipelines.command import done, refused
-from tests.pipelines.running_service import COMMAND, frame, serving, status, wait_for
+from tests.pipelines.command import COMMAND, done, refused
+from tests.pipelines.forked import run
+from tests.pipelines.running_service import frame, serving, status, wait_for
 
 
 def test_clients_share_one_tracker_and_one_may_listen():
@@ -242,9 +243,7 @@ def test_a_pipe_whose_reader_sleeps_ends_too_and_keeps_its_state(tmp_path):
     os.close(write)
     assert server.returncode == 143
     assert b"Traceback" not in errors
-    command = [*COMMAND, "serve", "--snapshot", str(tmp_path / "state")]
-    done = subprocess.run(command, input=frame(1), capture_output=True, check=True)
-    answer = json.loads(done.stdout)
+    answer = json.loads(run("serve", "--snapshot", tmp_path / "state", given=frame(1))[0])
     assert (answer["type"], answer["last_seq"]) == ("repeat", 1)
 
 
@@ -297,11 +296,10 @@ def test_settings_for_dense_traffic_are_those_of_track_and_a_file_lies_over_them
         (("--like", "dense", "--config", config), "dense", config, f"{config}: over the settings of --like dense"),
     ]
     for options, family, own, said in cases:
-        command = [*COMMAND, "serve", *map(str, options)]
-        served = subprocess.run(command, input=stream, capture_output=True, check=True)
-        assert served.stderr.decode().count(said or "over the settings") == (said != "")
+        out, errors = run("serve", *options, given=stream)
+        assert errors.count(said or "over the settings") == (said != "")
         tracker = load_config(family, own).new_tracker("saga")
-        for given, line in zip(frames, served.stdout.splitlines(), strict=True):
+        for given, line in zip(frames, out.splitlines(), strict=True):
             cars = [Detection(c["label"], (c["x"], c["y"], 0.0), yaw=c["yaw"]) for c in given["detections"]]
             tracks = tracker.step(Frame(given["timestamp"], "sensor", Detections.of(cars)))
             answer = json.loads(line)["tracks"]
@@ -317,5 +315,5 @@ def test_a_file_of_settings_decides_about_dense_traffic(tmp_path):
     stream, config = "\n".join(map(json.dumps, frames)).encode(), tmp_path / "c.yaml"
     config.write_text("tracker: {min_hits: 2}\n")
     for options, told in (((), True), (("--config", str(config)), False), (("--method", "centerpoint"), False)):
-        served = subprocess.run([*COMMAND, "serve", *options], input=stream, capture_output=True, check=True)
-        assert ("dense traffic: 6 vehicles at a time with headings, 10 Hz" in served.stderr.decode()) == told
+        _, errors = run("serve", *options, given=stream)
+        assert ("dense traffic: 6 vehicles at a time with headings, 10 Hz" in errors) == told

@@ -3,10 +3,12 @@
 import asyncio
 import json
 import resource
+import signal
 import socket
 import threading
 import time
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import pytest
 
 from pipelines.serving import Address, SocketServer, StreamClient, StreamSettings
 from saga_fg.errors import InputError
+from tests.pipelines.command import COMMAND
 from tests.pipelines.running_service import frame, limits, serving, status, wait_for
 
 
@@ -102,8 +105,7 @@ def received(client: socket.socket) -> bytes:
         return b""
 
 
-def few_files() -> None:
-    resource.setrlimit(resource.RLIMIT_NOFILE, (1024, 1024))
+FEW_FILES = partial(resource.setrlimit, resource.RLIMIT_NOFILE, (1024, 1024))
 
 
 def test_more_connections_than_files_do_not_end_the_service(tmp_path):
@@ -111,7 +113,7 @@ def test_more_connections_than_files_do_not_end_the_service(tmp_path):
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 4096), hard))
     try:
         many = limits(tmp_path, max_clients=100000)
-        with serving("--listen", "127.0.0.1:0", *many, before=few_files) as (address, server), ExitStack() as stack:
+        with serving("--listen", "127.0.0.1:0", *many, before=FEW_FILES) as (address, server), ExitStack() as stack:
             good = stack.enter_context(StreamClient(address))
             for _ in range(1100):
                 stack.enter_context(connected(address))
@@ -128,7 +130,7 @@ def test_more_connections_than_files_do_not_end_the_service(tmp_path):
 
 def test_a_service_without_files_left_takes_connections_again_later():
     """The limit is lowered under the open connections: accepting fails until some are closed."""
-    with serving("--listen", "127.0.0.1:0") as (address, server):
+    with serving("serve", "--listen", "127.0.0.1:0", command=COMMAND) as (address, server):
         with StreamClient(address) as good:
             good.ask({"type": "status"})
             used = len(list(Path(f"/proc/{server.pid}/fd").iterdir()))
@@ -204,7 +206,7 @@ def test_a_flood_of_late_frames_is_no_flood_of_warnings():
         for seq in range(300):
             client.send({"timestamp": 100.0 if seq == 0 else 95.0 + seq % 2, "sensor": str(seq), "detections": []})
             client.receive()
-        server.terminate()
+        server.send_signal(signal.SIGTERM)
         _, errors = server.communicate(timeout=60)
         assert sum(" late and is left out" in line for line in errors.splitlines()) <= 1
 

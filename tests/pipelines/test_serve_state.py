@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import stat
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,8 @@ from pipelines.serving.messages import encode
 from pipelines.serving.state import read_state, write_state
 from saga_fg import InputError
 from tests.pipelines.command import refused
-from tests.pipelines.running_service import COMMAND, frame, serving, status, wait_for
+from tests.pipelines.forked import run
+from tests.pipelines.running_service import frame, serving, status, wait_for
 
 FRAMES = 40
 
@@ -57,7 +57,7 @@ def test_after_a_kill_a_client_goes_on_where_the_state_ends(tmp_path):
         told = status(address)
         assert (told["frames"], told["taken"]) == (FRAMES, {"sensor": FRAMES})
         server.send_signal(signal.SIGTERM)
-        server.communicate()
+        server.wait()
         assert server.returncode == 143
     with serving(*keeping) as (address, _):  # the last state is written on the way out
         assert status(address)["durable_seq"] == {"sensor": FRAMES - 1}
@@ -77,15 +77,14 @@ def test_frames_that_were_held_are_sent_again(tmp_path):
         sent(address, range(6, 12))
         assert status(address)["taken"] == {"sensor": 8}
         server.send_signal(signal.SIGTERM)
-        server.communicate()
+        server.wait()
     with serving(*reordering) as (address, _):
         assert status(address)["taken"] == {"sensor": 12}
 
 
 def test_the_state_of_another_configuration_is_refused_and_stays(tmp_path):
     state = tmp_path / "state"
-    command = [*COMMAND, "serve", "--snapshot", str(state)]
-    subprocess.run(command, input=frame(0), capture_output=True, check=True)
+    run("serve", "--snapshot", state, given=frame(0))
     whole = state.read_bytes()
     said = refused("serve", "--snapshot", state, "--estimator", "isam2")
     assert "'estimator: kalman' instead of 'estimator: isam2'" in said
@@ -110,9 +109,7 @@ def test_a_state_file_is_of_one_service(tmp_path):
         assert sent(address, range(1))[0]["type"] == "tracks"
         server.kill()
         server.wait()
-    command = [*COMMAND, "serve", "--snapshot", str(tmp_path / "state")]
-    done = subprocess.run(command, input=frame(0), capture_output=True, check=False)  # a killed one holds nothing
-    assert done.returncode == 0
+    run("serve", "--snapshot", tmp_path / "state", given=frame(0))  # a killed one holds nothing
 
 
 # A state on disk: whole, for its owner, and of the same configuration, or refused in one line

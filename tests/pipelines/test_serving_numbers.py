@@ -2,7 +2,6 @@
 
 import json
 import logging
-import subprocess
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
@@ -14,7 +13,7 @@ from pipelines.serving import StreamSettings, StreamTracker
 from pipelines.serving.messages import encode
 from pipelines.serving.stream import Numbering
 from saga_fg import Frame, Tracks
-from tests.pipelines.running_service import COMMAND
+from tests.pipelines.forked import run
 
 
 def stream(**settings: Any) -> StreamTracker[None]:
@@ -72,11 +71,9 @@ def test_a_reset_brings_back_no_held_number_and_of_no_sensor_nothing():
 
 
 def test_the_reset_of_a_sensor_is_kept(tmp_path):
-    command = [*COMMAND, "serve", "--snapshot", str(tmp_path / "state"), "--every", "3600"]
-
     def told(*lines: bytes) -> list[dict[str, Any]]:
-        done = subprocess.run(command, input=b"\n".join(lines), capture_output=True, check=True)
-        return [json.loads(line) for line in done.stdout.splitlines()]
+        out, _ = run("serve", "--snapshot", tmp_path / "state", "--every", "3600", given=b"\n".join(lines))
+        return [json.loads(line) for line in out.splitlines()]
 
     told(frame(5, 0.0), frame(6, 0.1))
     first, second = told(reset("lidar"), frame(0, 0.2))

@@ -120,7 +120,7 @@ def test_labels_of_a_table_are_judged_by_a_table_of_truth(tmp_path):
 
 def _short(folder: Path) -> Path:
     path = folder / "simulator.yaml"
-    path.write_text("duration: 3.0\n")
+    path.write_text("duration: 2.0\nwarm_up: 5.0\n")
     return path
 
 
@@ -202,7 +202,7 @@ def test_sizes_that_nobody_measured_stay_unknown_and_moments_between_frames_are_
 
 # Labels of recordings are nearer to the truth than the online tracks, in every class, on the boxes that both have
 
-SCENES = {"nuscenes": ("scene-0061", "scene-0553", "scene-1094"), "kitti": ("0000", "0011", "0017")}
+SCENES = {"nuscenes": ("scene-0061", "scene-0553"), "kitti": ("0000", "0017")}
 FEWEST = 30  # boxes of a class that is compared
 
 
@@ -290,7 +290,7 @@ def of_both(scene: Scene, config: SmoothConfig, label: str | None = "pedestrian"
 @pytest.fixture(scope="module")
 def crowds() -> tuple[LabelErrors, LabelErrors]:
     config = load_smooth_config("nuscenes")
-    online, labels = zip(*(of_both(crowd(seed), config) for seed in range(3)), strict=True)
+    online, labels = zip(*(of_both(crowd(seed), config) for seed in range(2)), strict=True)
     return LabelErrors.pool(online), LabelErrors.pool(labels)
 
 
