@@ -1,10 +1,11 @@
-"""Pairs of tracks and measurements, or of tracks and their returns: gates, costs, overlap of boxes."""
+"""Pairs of tracks and measurements, of tracks and their returns, of boxes: gates, costs, overlap, who hides whom."""
 
 import math
 
 import numpy as np
 
-from saga_fg.kernels.compilation import BoolArray, FloatArray, IntArray, kernel
+from saga_fg.kernels.compilation import BoolArray, FloatArray, IntArray, kernel, kernel_part
+from saga_fg.kernels.edges import wrapped
 
 Gated = tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]
 
@@ -319,4 +320,82 @@ def paired_overlaps(
                 share = max(leave - enter, 0.0)
                 total += share * (x[k] * dy[k] - y[k] * dx[k]) if turn == 0 else share * 2 * gx * gy
         result[i] = min(max(total / 2, 0.0), min(4 * hx * hy, 4 * gx * gy))
+    return result
+
+
+@kernel_part
+def _crossed(angle: float, x: float, y: float, yaw: float, size: FloatArray) -> tuple[float, float]:
+    """Ranges at which a ray from the origin enters and leaves the footprint of a box at x, y; inf where it misses."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    own_x, own_y = -(c * x + s * y), s * x - c * y
+    dx, dy = math.cos(angle - yaw), math.sin(angle - yaw)
+    dx, dy = 1e-12 if abs(dx) < 1e-12 else dx, 1e-12 if abs(dy) < 1e-12 else dy
+    x1, x2 = (-size[0] / 2 - own_x) / dx, (size[0] / 2 - own_x) / dx
+    y1, y2 = (-size[1] / 2 - own_y) / dy, (size[1] / 2 - own_y) / dy
+    enters, leaves = max(min(x1, x2), min(y1, y2)), min(max(x1, x2), max(y1, y2))
+    if enters <= leaves and leaves > 0:
+        return max(enters, 0.0), leaves
+    return math.inf, math.inf
+
+
+@kernel("f1 f2 f1 f2 i1 b1 b i")
+def visible_shares(
+    viewpoint: FloatArray,
+    position: FloatArray,
+    yaw: FloatArray,
+    size: FloatArray,
+    targets: IntArray,
+    solid: BoolArray,
+    estimated: bool,
+    rays: int,
+) -> FloatArray:
+    """(k,) share of the boxes `targets` (k,) of n that are visible from a point, see `saga_fg.tracking.update`.
+
+    solid (n,) can hide others; estimated: none hides what it overlaps; 1 where a size or heading is unknown
+    """
+    n, k = len(yaw), len(targets)
+    x, y, bearing, low, high = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    nearest, farthest, known = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
+    for i in range(n):
+        x[i], y[i] = position[i, 0] - viewpoint[0], position[i, 1] - viewpoint[1]
+        known[i] = math.isfinite(x[i] + y[i] + yaw[i] + size[i, 0] + size[i, 1] + size[i, 2])
+        bearing[i], low[i], high[i], farthest[i] = math.atan2(y[i], x[i]), math.inf, -math.inf, 0.0
+        nearest[i] = math.hypot(x[i], y[i]) - math.hypot(size[i, 0], size[i, 1]) / 2
+        c, s = math.cos(yaw[i]), math.sin(yaw[i])
+        for corner in range(4):
+            hx = size[i, 0] / 2 if corner % 2 else -size[i, 0] / 2
+            hy = size[i, 1] / 2 if corner // 2 else -size[i, 1] / 2
+            cx, cy = x[i] + c * hx - s * hy, y[i] + s * hx + c * hy
+            spread = wrapped(math.atan2(cy, cx) - bearing[i])
+            low[i], high[i] = min(low[i], spread), max(high[i], spread)
+            farthest[i] = max(farthest[i], math.hypot(cx, cy))
+    result = np.ones(k)
+    angle, own, highest = np.empty(rays), np.empty(rays), np.empty(rays)
+    for j in range(k):
+        t = targets[j]
+        if not known[t]:
+            continue
+        for ray in range(rays):
+            angle[ray] = bearing[t] + low[t] + (ray + 0.5) / rays * (high[t] - low[t])
+            own[ray], _ = _crossed(angle[ray], x[t], y[t], yaw[t], size[t])
+            if math.isinf(own[ray]):
+                own[ray] = math.hypot(x[t], y[t])
+            highest[ray] = 0.0
+        for i in range(n):
+            if i == t or not (solid[i] and known[i]) or nearest[i] >= farthest[t]:
+                continue
+            between = wrapped(bearing[i] - bearing[t])
+            beside = nearest[i] < 0.5  # m: it may fill more than half the circle
+            if not beside and (between + low[i] >= high[t] or between + high[i] <= low[t]):
+                continue
+            rise = size[i, 2] - viewpoint[2]
+            for ray in range(rays):
+                enters, leaves = _crossed(angle[ray], x[i], y[i], yaw[i], size[i])
+                if not math.isinf(enters) and (leaves <= own[ray] if estimated else enters < own[ray]):
+                    rim = max(leaves if rise < 0 else enters, 0.1)
+                    highest[ray] = max(highest[ray], viewpoint[2] + rise * own[ray] / rim)
+        shown = 0.0
+        for ray in range(rays):
+            shown += min(max((size[t, 2] - highest[ray]) / size[t, 2], 0.0), 1.0)
+        result[j] = shown / rays
     return result

@@ -223,7 +223,10 @@ def _rivals(found: CandidatePairs, matching: Matching, possible: BoolArray) -> I
     owner[matching.detection] = matching.track
     other = owner[found.detection]
     doubtful = possible & (other >= 0) & (other != found.track)
-    return np.unique(np.sort(np.column_stack([found.track, other])[doubtful], axis=1), axis=0)
+    pairs = {
+        (min(pair), max(pair)) for pair in zip(found.track[doubtful].tolist(), other[doubtful].tolist(), strict=True)
+    }
+    return np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
 
 
 def _candidates(

@@ -121,6 +121,8 @@ class Encounters(Columns):
 
     def live(self, tracks: IntArray, time: float) -> Self:
         """Select the encounters between present `tracks` (n,) that are still undecided at a time, s."""
+        if len(self) == 0:
+            return self
         there = np.isin(self.ids, tracks).all(axis=1)
         return self.select(there & (time - self.since <= MEMORY) & (self.log_odds > UNLIKELY))
 
@@ -152,6 +154,8 @@ class Encounters(Columns):
 
     def exchanges(self, seen: IntArray) -> list[tuple[int, int, float]]:
         """The likeliest pair of tracks, if it is likely, of those of which both are `seen` (k,) now; since when, s."""
+        if self.log_odds.max(initial=-np.inf) < LIKELY:
+            return []
         odds = np.where(np.isin(self.ids, seen).all(axis=1), self.log_odds, -np.inf)
         best = np.flatnonzero(odds == odds.max(initial=LIKELY))[:1]
         return [(*self.ids[k].tolist(), float(self.since[k])) for k in best]

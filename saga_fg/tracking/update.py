@@ -63,8 +63,9 @@ from dataclasses import replace
 import numpy as np
 
 from factors import RangeRate
+from saga_fg.kernels.pairs import visible_shares
 from saga_fg.model import POSITION, VELOCITY, own_motion
-from saga_fg.numerics import BoolArray, FloatArray, IntArray, Matching, StrArray, chi_square_quantile, wrap_angle
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, Matching, StrArray, chi_square_quantile
 from saga_fg.tracking.joint_state import moved_to_present
 from saga_fg.tracking.measurements import FrameMeasurements, relative_covariances
 from saga_fg.tracking.track_filters import MOVING, Kinematics
@@ -106,61 +107,9 @@ def visible_share(
     are visible and hide nothing. solid: mask (N,) of the boxes that can hide others, of estimated ones, which hide
     nothing that they overlap; None: all, of true ones.
     """
-    if len(targets) == 0:
-        return np.empty(0)
-    centre = boxes.position[:, :2] - viewpoint[:2]
-    bearing = np.arctan2(centre[:, 1], centre[:, 0])
-    corners = boxes.corners() - viewpoint[:2]
-    spread = wrap_angle(np.arctan2(corners[..., 1], corners[..., 0]) - bearing[:, None])
-    low, high = spread.min(axis=1), spread.max(axis=1)
-    reach = np.linalg.norm(corners, axis=-1).max(axis=1)
-    nearest = np.linalg.norm(centre, axis=1) - np.hypot(boxes.size[:, 0], boxes.size[:, 1]) / 2
-
-    between = wrap_angle(bearing[None, :] - bearing[targets, None])
-    overlaps: BoolArray = (
-        (between + low[None, :] < high[targets, None])
-        & (between + high[None, :] > low[targets, None])
-        & (nearest[None, :] < reach[targets, None])
-    )
-    overlaps |= nearest[None, :] < 0.5  # a box beside the sensor may fill more than half the circle
-    overlaps[np.arange(len(targets)), targets] = False
-    if solid is not None:
-        overlaps &= solid
-    target, other = np.nonzero(overlaps)
-
-    cell = (np.arange(rays) + 0.5) / rays
-    angle = bearing[targets, None] + low[targets, None] + cell * (high - low)[targets, None]
-    own, _ = _crossing(angle, centre[targets], boxes.yaw[targets], boxes.size[targets])
-    own = np.where(np.isfinite(own), own, np.linalg.norm(centre[targets], axis=1)[:, None])
-    enters, leaves = _crossing(angle[target], centre[other], boxes.yaw[other], boxes.size[other])
-    r = own[target]
-    rise = boxes.size[other, 2] - viewpoint[2]
-    rim = np.where(rise[:, None] < 0, leaves, enters)
-    hides = ((enters < r) if solid is None else (leaves <= r)) & np.isfinite(enters)
-    with np.errstate(invalid="ignore"):
-        shadow = np.where(hides, viewpoint[2] + rise[:, None] * r / np.maximum(rim, 0.1), 0.0)
-    highest = np.zeros((len(targets), rays))
-    np.maximum.at(highest, target, shadow)
-    height = boxes.size[targets, 2][:, None]
-    shown = np.clip((height - highest) / height, 0.0, 1.0).mean(axis=1)
-    return np.asarray(np.where(np.isfinite(shown), shown, 1.0))
-
-
-def _crossing(
-    angle: FloatArray, centre: FloatArray, yaw: FloatArray, size: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Ranges (P, rays) at which rays from the origin enter and leave P rectangles; inf where they miss."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    origin = np.stack([-(c * centre[:, 0] + s * centre[:, 1]), s * centre[:, 0] - c * centre[:, 1]], axis=-1)
-    local = angle - yaw[:, None]
-    direction = np.stack([np.cos(local), np.sin(local)], axis=-1)
-    direction = np.where(np.abs(direction) < 1e-12, 1e-12, direction)
-    half = size[:, None, :2] / 2
-    first, second = (-half - origin[:, None]) / direction, (half - origin[:, None]) / direction
-    enters = np.minimum(first, second).max(axis=-1)
-    leaves = np.maximum(first, second).min(axis=-1)
-    hit = (enters <= leaves) & (leaves > 0)
-    return np.where(hit, np.maximum(enters, 0.0), np.inf), np.where(hit, leaves, np.inf)
+    hiding = np.ones(len(boxes), dtype=np.bool_) if solid is None else solid
+    estimated = solid is not None
+    return visible_shares(viewpoint, boxes.position, boxes.yaw, boxes.size, targets, hiding, estimated, rays)
 
 
 MIN_SHARE = 0.02  # of a detection, by which its track is still updated
@@ -236,9 +185,10 @@ def follow_encounters(
         seen, z, R = d >= 0, np.zeros((len(known), 2, 2)), np.zeros((len(known), 2, 2, 2))
         z[seen] = measurements.boxes.position[d[seen], :2] - state.origin
         R[seen] = measurements.R[d[seen], :2, :2]
-        first = rows[:, 0]
-        of_type = zip(joint.types_of(table.label[first]), places[first, 2].tolist(), strict=True)
-        noise = np.array([own_motion(node_type, 1.0)[1][at, at] for node_type, at in of_type])
+        label = table.label[rows[:, 0]].tolist()
+        types = {name: joint.type_of(name) for name in set(label)}
+        of_class = {name: own_motion(each, 1.0)[1][each.planar[2], each.planar[2]] for name, each in types.items()}
+        noise = np.array([of_class[name] for name in label])
         known = known.followed(noise, np.where(known.since < state.time, elapsed, 0.0), z, R, seen)
     state.encounters = known
 

@@ -145,6 +145,8 @@ class Relations:
 
     def between(self, ids: IntArray) -> Self:
         """Select those whose tracks are both among the `ids` (n,)."""
+        if len(self) == 0:
+            return self
         kept = np.isin(self.source, ids) & np.isin(self.target, ids)
         return type(self)(self.source[kept], self.target[kept], self.name[kept], self.probability[kept])
 
