@@ -179,11 +179,16 @@ def velocities_between_frames(time: FloatArray, label: StrArray, position: Float
 
 
 def shared_motion(time: FloatArray, motion: FloatArray) -> FloatArray:
-    """The motion (n, 2) that most objects share in the second of each row, by motions (n, 2); NaN where unknown."""
+    """The motion (n, 2) that most objects share in the second of each row, by motions (n, 2); NaN where unknown.
+
+    It is where frames, at times (n,), s, have three objects and more.
+    """
     shared, known = np.full(motion.shape, np.nan), np.isfinite(motion).all(axis=1)
     second = np.floor(time)
     for now in np.unique(second[known]).tolist():
         rows = np.flatnonzero(known & (second == now))[:MAX_FRAMES]
+        if len(rows) < 3 * len(np.unique(time[rows])):
+            continue
         near = np.hypot(*(motion[rows, None] - motion[None, rows]).transpose(2, 0, 1)) < _NEARLY_STILL
         shared[second == now] = motion[rows[near[near.sum(axis=1).argmax()]]].mean(axis=0)
     return shared
@@ -452,7 +457,7 @@ def _share_motion_of_vehicle(sample: Sample) -> bool:
     rows = np.flatnonzero(np.isnan(sample.ego[1]) & (sample.coordinates == "world").all())
     driven = np.where(sample.walks[:, None], np.nan, motion)
     for apart_of, moved, of, least in (
-        (_velocity_apart, motion, motion - velocity, 1.0),
+        (_velocity_apart, motion, motion - velocity, _MOVES),
         (_heading_apart, driven, driven, _ASTRAY),
     ):
         apart = [apart_of(sample, each, rows) for each in (moved, moved - shared_motion(time, of))]

@@ -73,7 +73,7 @@ def test_velocities_that_contradict_the_motion_are_named_as_such(kind, wrong):
             refuse_contradictions(read(made).findings)
 
 
-@pytest.mark.parametrize(("kind", "speeds"), [("crowd", True), ("crossing", True), ("parked street", False)])
+@pytest.mark.parametrize(("kind", "speeds"), [("queue", True), ("crossing", True), ("parked street", False)])
 def test_rows_of_the_vehicles_frame_without_its_pose_are_named(kind, speeds):
     world = table(kind, np.random.default_rng([88112, *map(ord, kind)]), speeds)
     pose = ["ego_x", "ego_y", "ego_yaw"]
