@@ -284,7 +284,12 @@ class Tracker:
             got = f"{since + checked[0]:.10g} to {since + checked[-1]:.10g}"
             within = f"from the newest frame, at {newest:.10g} s, to {LONGEST_PREDICTION:g} s later"
             raise InputError(f"predict: expected times {within}, got {got}")
-        found = look_ahead(self._state.copied(), ahead, joint, hypotheses)
+        try:
+            found = look_ahead(self._state.copied(), ahead, joint, hypotheses)
+        except Exception as error:
+            if (named := self._of_own_part(error)) is not None:
+                raise named from error
+            raise
         return replace(found, timestamp=since, horizons=checked)
 
     def snapshot(self) -> TrackerSnapshot:

@@ -242,6 +242,14 @@ def test_a_class_model_decides_the_class_of_a_track(mine):
         assert set(tracks.boxes.label.tolist()) == {label}
 
 
+def test_what_breaks_in_a_prediction_is_named(mine, monkeypatch):
+    tracker = Tracker(TrackerSettings(edges=(mine.Chain(),)))
+    run(tracker)
+    monkeypatch.setattr(mine.Chain, "pairs", mine.Breaks.pairs)
+    with pytest.raises(InputError, match=r"edges\[0\] \(my_parts:Chain\): ZeroDivisionError"):
+        tracker.predict([1.0])
+
+
 def test_what_breaks_is_named(mine, subtests):
     with pytest.raises(InputError, match=r"edges\[0\] \(my_parts:Breaks\): ZeroDivisionError: division by zero"):
         run(Tracker(TrackerSettings(edges=(mine.Breaks(),)), {"lidar": Sensor()}))
