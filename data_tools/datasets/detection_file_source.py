@@ -130,7 +130,15 @@ class DetectionFileSource(DatasetSource):
 
     @property
     def how(self) -> TableImport:
-        """Options for reading the table of detections."""
+        """Options for reading tables."""
+        return self._over(self.table_import)
+
+    @property
+    def how_detections(self) -> TableImport:
+        """Options for reading detections: without what a file for --import says of columns of tracks alone."""
+        return self._over(_of_detections(self.table_import))
+
+    def _over(self, base: TableImport | None) -> TableImport:
         own = TableImport(
             pairs("--columns", self.columns),
             pairs("--classes", self.classes),
@@ -139,14 +147,14 @@ class DetectionFileSource(DatasetSource):
             self.sort,
             self.as_given,
         )
-        return own.over(self.table_import or TableImport())
+        return own.over(base or TableImport())
 
     def dense_traffic(self) -> str:
         """Why the first rows look like dense road traffic, "" if they do not, or are not those of one file here."""
         if len(self.detections or ()) != 1 or not Path(self._table()).is_file():
             return ""
         with local_copy(self._table()) as path:
-            return dense_traffic_of(path, self.how)
+            return dense_traffic_of(path, self.how_detections)
 
     def __str__(self) -> str:
         return ", ".join(name_of(place) for place in self.detections or ()) or "a table of tracks"
@@ -161,7 +169,7 @@ class DetectionFileSource(DatasetSource):
             yield NoScenes()
             return
         with local_copy(self._table()) as path:
-            dataset = read_detections(path, self.how)
+            dataset = read_detections(path, self.how_detections)
         yield dataset if self.scenes is None else ChosenScenes(dataset, self.scenes, f"{path}: --scenes")
 
     def restricted(self, scenes: Collection[str]) -> Self:
@@ -174,14 +182,14 @@ class DetectionFileSource(DatasetSource):
         if not self.detections:
             yield Parts((), (), NoScenes())
             return
-        parts = [DetectionFilePart(url, self.how) for url in expanded(self.detections or ())]
+        parts = [DetectionFilePart(url, self.how_detections) for url in expanded(self.detections or ())]
         yield Parts([part.name for part in parts], parts)
 
     @contextmanager
     def stream(self) -> Iterator[Iterator[Scene]]:
         chosen = None if self.scenes is None else names("--scenes", self.scenes)
         with local_copy(self._table()) as path:
-            yield read_scenes_in_parts(path, scenes=chosen, how=self.how)
+            yield read_scenes_in_parts(path, scenes=chosen, how=self.how_detections)
 
     def read_results(self, result: Path, truth: bool = True) -> Results:
         return Results(self._results(result, truth), score_tables)
@@ -356,7 +364,7 @@ def found_results(
         dataset = DetectionTable(raw_table(detections, _of_detections(how)))
     if truth is not None:
         within = "how" if truth_how is None else "truth_how"
-        raw = raw_table(truth, truth_how or how, TRUTH_COLUMNS, TRACK_REQUIRED, within)
+        raw = raw_table(truth, truth_how or how, TRUTH_COLUMNS, TRACK_REQUIRED, within, lenient=True)
         true = TruthTable.from_table(raw, partial(tell, depth=_DEPTH))
         dataset = true if dataset is None else DetectedTruth(true, dataset)
     return table_results(
@@ -365,4 +373,5 @@ def found_results(
 
 
 def _rows(tracks: Table, how: TableImport | None) -> TrackRows:
-    return track_rows(raw_table(tracks, how, (*TRACK_COLUMNS, SETTLED), TRACK_REQUIRED), partial(tell, depth=_DEPTH))
+    raw = raw_table(tracks, how, (*TRACK_COLUMNS, SETTLED), TRACK_REQUIRED, lenient=True)
+    return track_rows(raw, partial(tell, depth=_DEPTH))

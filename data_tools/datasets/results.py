@@ -126,7 +126,7 @@ def table_results(
     for name in chosen:
         scene = dataset.scene(name)
         scene = _with_times(scene, rows) if own_times else scene
-        results[name] = scene_result(scene, _at_moments(rows, scene, path) if judged else rows, path)
+        results[name] = scene_result(*(_at_moments(rows, scene, path) if judged else (scene, rows)), path)
     if judged:
         _warn_of_classes(results, path, how or TableImport())
     return results
@@ -149,18 +149,27 @@ def _with_times(scene: Scene, rows: TrackRows) -> Scene:
     )
 
 
-def _at_moments(rows: TrackRows, scene: Scene, path: Path) -> TrackRows:
-    """The rows at the times that are nearest to the moments of a scene, if near enough, with these as their times."""
+def _at_moments(rows: TrackRows, scene: Scene, path: Path) -> tuple[Scene, TrackRows]:
+    """The rows at the times that are nearest to the moments of a scene, if near enough, with these as their times.
+
+    Where tracks come at a lower rate, the scene has the moments of both.
+    """
     mine = np.flatnonzero(rows.scene == scene.name)
     times = np.unique(rows.timestamp[mine])
     if not len(times) or not len(scene):
-        return rows.select(mine)
+        return scene, rows.select(mine)
     step = float(np.median(np.diff(scene.timestamps))) if len(scene) > 1 else 1.0
     reach = min(_NEAR_TIME, step / 4)
     nearest = times[nearest_rows(times, scene.timestamps)]
     near = np.abs(nearest - scene.timestamps) <= reach
     within = (scene.timestamps >= times[0] - step) & (scene.timestamps <= times[-1] + step)
     if not near.any() or near[within].mean() < 0.5:
+        steps = np.diff(times)
+        usual = float(np.median(steps)) if near.sum() > 0.8 * len(times) > 2 else step
+        if usual > 1.5 * step and np.mean(np.abs(steps - usual) < 0.25 * usual) > 0.8:
+            what = f"tracks are {usual:.3g} s apart, the truth {step:.3g} s: judged at the {near.sum()} moments of both"
+            log.warning("%s: scene %s: %s", path, scene.name, what)
+            return _at_moments(rows, _with_moments(scene, np.flatnonzero(near)), path)
         later = scene.timestamps[0] - times[0]
         moved = times[nearest_rows(times + later, scene.timestamps)] + later
         fits = (np.abs(moved - scene.timestamps) <= reach).mean() >= 0.5
@@ -176,7 +185,19 @@ def _at_moments(rows: TrackRows, scene: Scene, path: Path) -> TrackRows:
     missing = int((~near).sum())
     if missing > _FEW * len(scene):
         log.warning("%s: scene %s: no tracks at %d of %d moments of the truth", path, scene.name, missing, len(scene))
-    return replace(rows.select(mine[kept]), timestamp=moved[kept])
+    return scene, replace(rows.select(mine[kept]), timestamp=moved[kept])
+
+
+def _with_moments(scene: Scene, moments: IntArray) -> Scene:
+    """A scene with some of its moments alone."""
+    truth = scene.ground_truth
+    return replace(
+        scene,
+        timestamps=scene.timestamps[moments],
+        world_T_ego=scene.world_T_ego[moments],
+        tokens=tuple(scene.tokens[k] for k in moments.tolist()),
+        ground_truth=None if truth is None else [truth[k] for k in moments.tolist()],
+    )
 
 
 def nearest_rows(times: FloatArray, moments: FloatArray) -> IntArray:

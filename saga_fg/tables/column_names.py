@@ -35,6 +35,9 @@ FACTORS: Mapping[Kind, Mapping[str, float]] = {
     | {"compass": -pi / 180, "compass_rad": -1.0},
     "score": {"share": 1.0, "percent": 0.01},
 }
+_BY_SIZE = {"times": "timestamp", "angle in degrees": "yaw", "ego_yaw in degrees": "ego_yaw", "lengths": "length"}
+_BY_SIZE["places"] = "x"
+"""Columns, whose units are told by the size of numbers alone, by the kind of the finding."""
 _DEGREES = {"clockwise": "clockwise_deg", "compass_rad": "compass"}
 OFFSETS = {"compass": pi / 2, "compass_rad": pi / 2}
 """Offset of angles in these units, rad: a compass counts clockwise from the y axis, which is north."""
@@ -233,10 +236,15 @@ def meaning(name: str) -> tuple[str, str | None] | None:
     ours = canonical(name)
     if ours is not None:
         return ours, None
-    start, _, end = _plain(name).rpartition("_")
-    ours = canonical(start) if start else None
-    unit = None if ours is None else UNITS.get(kind_of.get(ours, ""), {}).get(end)
+    ours = canonical(_plain(name).rpartition("_")[0])
+    unit = None if ours is None else _unit_at_end(ours, name)
     return None if ours is None or unit is None else (ours, unit)
+
+
+def _unit_at_end(ours: str, name: str) -> str | None:
+    """The unit at the end of a file's name of a column of ours, None for none."""
+    start, _, end = _plain(name).rpartition("_")
+    return UNITS.get(kind_of.get(ours, ""), {}).get(end) if start and canonical(name) is None else None
 
 
 def understood(
@@ -303,12 +311,8 @@ def understood(
         wanted = " and ".join(f"a column {ours!r}" for ours in missing)
         mend = f"; name it: {naming(dict.fromkeys(missing, 'NAME'))}" if names else ""
         faults.insert(0, f"expected {wanted}, the columns there are {there}{mend}")
-    ends = {ours: meaning(name) for ours, name in chosen.items()}
-    units = {
-        ours: found[1]
-        for ours, found in ends.items()
-        if found is not None and found[1] and kind_of.get(found[0]) == kind_of.get(ours)
-    }
+    ends = {ours: _unit_at_end(ours, name) for ours, name in chosen.items()}
+    units = {ours: unit for ours, unit in ends.items() if unit is not None}
     return Columns(chosen, units, tuple(unread), tuple(faults), mends)
 
 
@@ -419,7 +423,7 @@ class TableImport(Settings):
 
         def mended(name: str, unit: str) -> str:
             column = "yaw" if name == "angle" else name
-            by_name = (meaning(names[column]) or ("", None))[1] if column in names else None
+            by_name = _unit_at_end(column, names.get(column, ""))
             return _DEGREES.get(unit, unit) if self.unit(column, by_name) == "deg" else unit
 
         return {name: mended(name, unit) if _kind(name) == "angle" else unit for name, unit in units.items()}
@@ -432,12 +436,17 @@ class TableImport(Settings):
 
     def _possible(self, mend: Mend, names: Mapping[str, str]) -> Mend | None:
         """What mends a suspicion: without speeds that are read as m/s already; None where all of it is said here."""
-        by_name = (meaning(names.get("vx", "")) or ("", None))[1]
+        by_name = _unit_at_end("vx", names.get("vx", ""))
         if mend.units.get("speed") == "m/s" and self.unit("vx", by_name) in (None, "m/s"):
             units = {name: unit for name, unit in mend.units.items() if name != "speed"}
             mend = replace(mend, units=units, columns={**mend.columns, "vx": "", "vy": ""})
         mended = self.mended(mend, {})
         return mend if any(getattr(mended, each.name) != getattr(self, each.name) for each in fields(Mend)) else None
+
+    def _says(self, kind: str) -> bool:
+        """True if a suspicion stops nothing: it rests on the size of numbers, and their unit is given here."""
+        column = _BY_SIZE.get(kind, "")
+        return self.as_given or bool({column, kind_of.get(column)} & self.units.keys())
 
     def judged(
         self, findings: Iterable[Finding], names: Mapping[str, str], within: str = COMMAND
@@ -445,7 +454,7 @@ class TableImport(Settings):
         """The findings, each with the options that mend it, as of `option_for`, and whether the table contradicts how
         it is read."""
         judged = [one if one.mend is None else replace(one, mend=self._possible(one.mend, names)) for one in findings]
-        judged = [replace(one, stops=not self.as_given and one.contradicts) for one in judged]
+        judged = [replace(one, stops=one.contradicts and not self._says(one.kind)) for one in judged]
         together = reduce(or_, (one.mend for one in judged if one.stops and one.mend is not None), Mend())
         mends = [together if one.stops else one.mend for one in judged]
         options = ["" if mend is None else self.option_for(mend, names, within) for mend in mends]

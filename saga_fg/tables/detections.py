@@ -221,11 +221,13 @@ def raw_table(
     columns: Sequence[str] = COLUMNS,
     required: Sequence[str] = REQUIRED,
     within: str = "how",
+    lenient: bool = False,
 ) -> RawTable:
     """Return the columns of a table that have a meaning among `columns`, in order of time if they have times.
 
     how     what it takes to understand it; what is left out is found by the names of the columns
     within  the argument of the program that is `how`
+    lenient whether columns that `how` names need not be there, as none that has no meaning here
 
     Raises `InputError` for something else, and for columns that are missing, misspelt, or could be either of two.
     """
@@ -242,7 +244,8 @@ def raw_table(
         raise InputError(f"{NAME}: expected every column once: {str(error).splitlines()[0]}") from error
     how = TableImport() if how is None else how
     require_type("how", how, TableImport)
-    found = understood(names, columns, required, how.columns, within=within)
+    given = {ours: theirs for ours, theirs in how.columns.items() if ours in columns}
+    found = understood(names, columns, required, given, lenient, within)
     if found.faults:
         raise InputError(f"{NAME}: {'; '.join(found.faults)}")
     index, clock = nw.maybe_get_index(frame), None

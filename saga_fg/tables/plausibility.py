@@ -141,7 +141,8 @@ def within_a_metre(frame: IntArray, position: FloatArray) -> Finding | None:
     what = f"all objects of all frames are within {spread:.2g} m: positions look like "
     middle = np.abs(np.median(mine, axis=0))
     if middle.max() > 5 and middle.min() <= 90 and middle.max() <= 180:
-        return Finding("places", what + "degrees of latitude and longitude", "expected metres in a plane, such as UTM")
+        degrees = "degrees of latitude and longitude, where metres in a plane such as that of UTM are expected"
+        return Finding("places", what + degrees, "", Mend(columns={"x": FILL_IN, "y": FILL_IN}))
     return Finding("places", what + "km", "expected metres", Mend(units={"length": "km"}))
 
 

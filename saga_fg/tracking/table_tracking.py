@@ -213,8 +213,9 @@ def predict(
 
 
 def _tell_default(settings: TrackerSettings | Like | None) -> None:
-    """Warn, at the caller's caller, of a default that fits no table."""
-    if isinstance(settings, TrackerSettings) and settings.min_hits == TrackerSettings().min_hits:
+    """Warn, at the caller's caller, of a default that fits no table, where others were changed."""
+    usual = TrackerSettings()
+    if isinstance(settings, TrackerSettings) and settings != usual and settings.min_hits == usual.min_hits:
         what = f"settings: min_hits is at its default, {settings.min_hits}"
         what = f"{what}, where tables without settings have {plain_settings().min_hits}"
         warnings.warn(f"{what}: change what saga_fg.tracking.plain_settings() gives", stacklevel=3)
@@ -269,9 +270,13 @@ def read_scenes(
     sensors = UNKNOWN_SENSORS if sensors is None else checked_sensors(sensors)
     raw = raw_table(detections, how)
     scenes = scenes_of(raw)
-    undecided = settings is None and method != "centerpoint"
+    own = isinstance(settings, TrackerSettings) and settings.traffic == TrackerSettings().traffic
+    undecided = (settings is None or own) and method != "centerpoint"
     why = seems_dense_traffic(scenes[0].frames) if scenes and undecided else ""
-    if why:
+    if why and own:
+        what = "settings: dense_traffic_settings() of saga_fg.tracking fit better than those given"
+        warnings.warn(f"{what}, as 'dense' does: {why}", stacklevel=3)
+    elif why:
         warnings.warn(f"settings for dense traffic: {why}; settings='plain' takes others", stacklevel=3)
         settings = "dense"
     dense = settings == "dense"

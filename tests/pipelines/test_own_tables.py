@@ -186,6 +186,9 @@ def test_decimal_commas_and_other_encodings_are_told_in_one_line(tmp_path):
     tracked = saga_fg("track", "file", table, "-o", tmp_path / "t.csv")
     assert f"{table}: expected text in UTF-8, line 3 is in another encoding, such as Latin-1" in tracked.stderr
     assert f"iconv -f latin1 -t utf-8 {table}" in tracked.stderr
+    table.write_bytes("time,x,y,label\n0,1,2,car\n".encode("utf-16"))
+    tracked = saga_fg("track", "file", table, "-o", tmp_path / "t.csv")
+    assert f"line 1 is in UTF-16; convert the file: iconv -f utf-16 -t utf-8 {table}" in tracked.stderr
 
 
 def test_without_truth_it_is_asked_for(tmp_path):
@@ -196,7 +199,8 @@ def test_without_truth_it_is_asked_for(tmp_path):
 def test_the_same_in_a_file_and_in_options(tmp_path):
     found, _ = rows()
     table = write(tmp_path / "d.csv", found)
-    (tmp_path / "how.yaml").write_text("classes: {VEHICLE: car}\nunits: {angle: deg, score: percent}\nsort: true\n")
+    how = "columns: {id: name}\nclasses: {VEHICLE: car}\nunits: {angle: deg, score: percent}\nsort: true\n"
+    (tmp_path / "how.yaml").write_text(how)
     one = saga_fg("track", "file", table, "--import", tmp_path / "how.yaml", "-o", tmp_path / "a.csv")
     other = saga_fg(
         "track", "file", table, "--classes", "VEHICLE=car", "--units", "angle=deg,score=percent", "--sort",
@@ -204,6 +208,8 @@ def test_the_same_in_a_file_and_in_options(tmp_path):
     )  # fmt: skip
     assert one.exit_code == other.exit_code == 0, one.output + other.output
     assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+    named = saga_fg("track", "file", table, "--columns", "id=name", "-o", tmp_path / "a.csv")
+    assert "--columns id=name: there is no column 'name'" in named.stderr
     (tmp_path / "how.yaml").write_text("clases: {VEHICLE: car}\n")
     wrong = saga_fg("track", "file", table, "--import", tmp_path / "how.yaml", "-o", tmp_path / "a.csv")
     assert "how.yaml: clases: unknown key, did you mean 'classes'?" in wrong.stderr

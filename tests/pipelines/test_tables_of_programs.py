@@ -188,3 +188,29 @@ def test_a_column_that_is_not_found_is_named_as_the_function_takes_it(tracks):
 def test_classes_that_have_no_counterpart_are_named_with_the_argument(tracks, caplog):
     saga_fg.evaluate(tracks, TRUTH.assign(label="AUTO"), hota=False)
     assert "name them alike: how=TableImport(classes={'AUTO': 'car'})" in caplog.text
+
+
+def test_an_option_that_tracks_or_truth_alone_need_serves_all_functions(tracks):
+    how = TableImport(columns={"id": "name", "score": "certainty"})
+    truth = TRUTH.rename(columns={"id": "name"})
+    assert saga_fg.evaluate(tracks, truth, how=how, hota=False).tracking
+    with pytest.raises(InputError, match="there is no column 'certainty'"):
+        saga_fg.track(DETECTIONS, how=how)
+    only = TableImport(columns={"id": "name"})
+    pd.testing.assert_frame_equal(saga_fg.track(DETECTIONS, how=only), saga_fg.track(DETECTIONS))
+
+
+def test_the_unit_at_the_end_of_a_named_column_counts():
+    named = DETECTIONS.assign(east_cm=100 * DETECTIONS.x).drop(columns="x")
+    found = saga_fg.track(named, how=TableImport(columns={"x": "east_cm"}))
+    pd.testing.assert_frame_equal(found, saga_fg.track(DETECTIONS))
+
+
+def test_tracks_at_a_lower_rate_are_judged_where_they_are(tracks, caplog):
+    times = np.unique(tracks.timestamp)
+    seldom = tracks[tracks.timestamp.isin(times[::5])]
+    found = saga_fg.evaluate(seldom, TRUTH, hota=False)
+    assert "judged at the" in caplog.text
+    assert found.programs["tracking"]["overall"]["objects"] < len(TRUTH) / 4
+    with pytest.raises(InputError, match="expected tracks at the times of the ground truth"):
+        saga_fg.evaluate(tracks[tracks.timestamp.isin([*times[:3], *times[20:23], *times[-3:]])], TRUTH)

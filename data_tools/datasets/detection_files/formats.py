@@ -1,5 +1,6 @@
 """The formats of tables of boxes: CSV, newline-delimited JSON, NumPy archives, Parquet and Feather."""
 
+import codecs
 import csv
 import logging
 import shlex
@@ -160,8 +161,10 @@ def _foreign_line(path: Path) -> str:
             try:
                 line.decode()
             except UnicodeDecodeError:
-                convert = f"iconv -f latin1 -t utf-8 {shlex.quote(str(path))}"
-                return f", line {number} is in another encoding, such as Latin-1; convert the file: {convert}"
+                wide = line.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+                looks, code = ("UTF-16", "utf-16") if wide else ("another encoding, such as Latin-1", "latin1")
+                convert = f"iconv -f {code} -t utf-8 {shlex.quote(str(path))}"
+                return f", line {number} is in {looks}; convert the file: {convert}"
     return ""
 
 

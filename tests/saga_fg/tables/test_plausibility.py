@@ -111,6 +111,21 @@ def test_units_that_mend_are_those_of_how_a_table_is_read():
     assert of_column.unit("ego_yaw", None) is None
 
 
+def test_units_that_are_given_win_over_the_size_of_numbers(subtests):
+    frame = np.repeat(np.arange(20), 5)
+    for finding, given in [
+        (strange_time_steps(np.arange(60) * 30.0, np.full(60, "lidar")), {"time": "s"}),
+        (headings_in_degrees(np.linspace(0, 40, 60)), {"angle": "rad"}),
+        (headings_in_degrees(np.linspace(0, 40, 60), "ego_yaw"), {"ego_yaw": "rad"}),
+        (within_a_metre(frame, np.add(RNG.uniform(0, 0.1, (100, 3)), [48.1, 11.6, 0.0])), {"length": "m"}),
+    ]:
+        assert finding is not None
+        with subtests.test(finding.kind):
+            assert [one.stops for one in TableImport().judged([finding], {})] == [True]
+            assert [one.stops for one in TableImport(units=given).judged([finding], {})] == [False]
+            assert [one.stops for one in TableImport(units={"score": "percent"}).judged([finding], {})] == [True]
+
+
 def test_measured_velocities_against_motion(subtests):
     motion = RNG.normal(0, 6, (80, 2))
     for factor, found in [(1.0, None), (3.6, "km/h"), (2.237, "mph"), (3.281, "ft/s"), (0.5, None), (-3.6, None)]:
@@ -222,7 +237,7 @@ def test_within_a_metre():
     degrees = within_a_metre(frame, position / 1000 + [48.1, 11.6, 0.0])
     assert degrees is not None
     assert "degrees of latitude" in degrees.what
-    assert degrees.mend is None
+    assert option(degrees) == "--columns x=...,y=..."
     lonely = np.zeros((100, 3)) + RNG.normal(0, 0.1, (100, 3))
     assert within_a_metre(np.arange(100), lonely) is None  # one parked object
 
