@@ -32,6 +32,7 @@ from saga_fg.tables import idle_rules, pairs, usual_classes
 from saga_fg.types import FILL_IN, Finding, Mend
 
 MOST = 12  # scenes and classes that are listed
+UNREAD = 40  # columns without a meaning that are listed
 EPOCH = 1e8  # s, from which times count from 1970
 
 
@@ -113,8 +114,10 @@ def _show_columns(survey: TableSurvey) -> None:
     if "yaw" in survey.ranges and "yaw" not in names:
         low, middle, high = survey.ranges["yaw"]
         typer.echo(f"  {'yaw':<12} {low:>12.6g} {middle:>12.6g} {high:>12.6g} from the quaternion")
-    if raw.found.unread:
-        typer.echo(f"  not read: {', '.join(raw.found.unread)}")
+    for name, values in list(survey.unread.items())[:UNREAD]:
+        typer.echo(f"  {'not read:':<12} {name}: {', '.join(values)}, ...")
+    if len(survey.unread) > UNREAD:
+        typer.echo(f"  not read: {len(survey.unread)} in all")
 
 
 def _date(seconds: float) -> str:

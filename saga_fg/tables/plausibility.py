@@ -202,14 +202,14 @@ def share(mask: BoolArray) -> float:
     return float(np.mean(mask)) if len(mask) else 0.0
 
 
-TRAFFIC, LONGEST_STEP = 5, 0.3  # vehicles at a time; s between frames: leaders and trails matter from here on
+TRAFFIC, LONGEST_STEP = 5, 0.6  # vehicles at a time; s between frames: leaders and trails matter from here on
 STANDING = 1.0  # m, within which a sensor stays that stands
 
 
 def seems_dense_traffic(frames: Sequence[Frame]) -> str:
     """Why the frames of a recording, its first seconds perhaps, show dense road traffic; "" if they do not.
 
-    They do with five vehicles at a time, each with a heading, at 3 Hz or more, by a sensor that stays where it is.
+    They do with five vehicles at a time, each with a heading, at 2 Hz or more, by a sensor that stays where it is.
     """
     detections = [frame.detections.boxes for frame in frames if len(frame.detections)]
     poses = np.array([frame.world_T_ego[:2, 3] for frame in frames if frame.world_T_ego is not None]).reshape(-1, 2)

@@ -11,7 +11,7 @@ over about half a second; positions in coordinates of the vehicle are moved to t
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -127,6 +127,7 @@ class TableSurvey:
     findings    about the table as it is read now
     faults    why it cannot be read as it is, a text each
     dense_traffic  why it looks like dense road traffic, "" if it does not
+    unread      a few values of each column that has no meaning here, as text
     """
 
     raw: RawTable
@@ -139,6 +140,7 @@ class TableSurvey:
     findings: tuple[Finding, ...]
     faults: tuple[str, ...] = ()
     dense_traffic: str = ""
+    unread: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def has_identities(self) -> bool:
@@ -168,7 +170,7 @@ def survey_table(path: Path, how: TableImport | None = None) -> TableSurvey:
             faults.append(str(error).removeprefix(f"{path}: "))
     known = {finding.kind: finding for finding in reversed(findings)}
     labels = raw.texts("label", "object")
-    detected = raw.present("x") if "x" in raw.columns else np.ones(raw.length, dtype=np.bool_)
+    detected = raw.present("x") if "x" in raw.columns else np.full(raw.length, bool(raw.columns))
     return TableSurvey(
         raw=raw,
         how=replace(how, sort=how.sort or not in_order),
@@ -180,7 +182,17 @@ def survey_table(path: Path, how: TableImport | None = None) -> TableSurvey:
         findings=tuple(known.values()),
         faults=tuple(faults),
         dense_traffic=dense,
+        unread=_unread_values(raw),
     )
+
+
+def _unread_values(raw: RawTable) -> dict[str, tuple[str, ...]]:
+    """The first different values of columns that have no meaning."""
+    if not raw.found.unread:
+        return {}
+    part = next(read_raw_parts(raw.path, Layout(raw.found.unread, ()), quiet=True))
+    columns = {name: part.columns.get(name, ()) for name in raw.found.unread}
+    return {name: tuple(dict.fromkeys(str(each)[:24] for each in values))[:3] for name, values in columns.items()}
 
 
 def _without_faults(raw: RawTable) -> tuple[RawTable, list[str]]:

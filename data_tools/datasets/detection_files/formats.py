@@ -52,7 +52,7 @@ class Layout:
     """The columns a table may have, and those it must.
 
     lenient  a column that --columns names need not be there
-    faulty   columns that are missing or misspelt are no error where some are understood
+    faulty   columns that are missing or misspelt are no error
     within   how its options are named, as of `option_text`
     """
 
@@ -81,7 +81,7 @@ class _Reading:
         """The columns of the file by their meaning. Raises `InputError` for all that is wrong with their names."""
         wanted, layout = self.hint(names).columns, self.layout
         found = understood(names, layout.columns, layout.required, wanted, layout.lenient, layout.within)
-        if found.faults and not (layout.faulty and found.names):
+        if found.faults and not (layout.faulty and names):
             raise InputError(f"{self.path}: {'; '.join(found.faults)}")
         return found
 
