@@ -3,7 +3,7 @@
 import json
 import math
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -228,12 +228,17 @@ WORST = 1.35  # factor between what was learned and the truth, at ranges where t
 
 @pytest.fixture(scope="module", params=[True, False], ids=["with truth", "without truth"])
 def noise_learned(request: pytest.FixtureRequest) -> LearnedNoise:
+    return learned_noise(request.param)
+
+
+@cache
+def learned_noise(with_truth: bool) -> LearnedNoise:
     """Noise learned from a start that is wrong everywhere."""
     start = load_config("simulated")
     wrong = Sensor(noise={DEFAULT: NoiseModel(position=0.3, range_noise=0.01, bearing_noise=0.01)})
     start = replace(start, sensors={DEFAULT: wrong})
     dataset = SimulatedTraffic(WORLD, scenes=2, seed=7)
-    return learn_noise(dataset, dataset.scenes, start, with_truth=request.param)
+    return learn_noise(dataset, dataset.scenes, start, with_truth=with_truth)
 
 
 def acceleration_noise(config: TrackConfig) -> float:
@@ -294,11 +299,7 @@ def test_the_fragment_leads_to_the_learned_settings(noise_learned, tmp_path):
 
 
 def test_process_noise_is_alike_with_and_without_truth():
-    dataset = SimulatedTraffic(WORLD, scenes=1, seed=3)
-    start = load_config("simulated")
-    with_truth, without = (
-        acceleration_noise(learn_noise(dataset, dataset.scenes, start, truth).config) for truth in (True, False)
-    )
+    with_truth, without = (acceleration_noise(learned_noise(truth).config) for truth in (True, False))
     assert 0.5 < with_truth / without < 2.0
 
 

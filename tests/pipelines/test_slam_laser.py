@@ -132,11 +132,11 @@ def test_a_gap_in_the_log_is_driven_by_the_wheels() -> None:
 @pytest.mark.parametrize(
     ("kind", "near", "far"),
     [
-        (LaserKind(readings=181, reach=8.0), 0.02, 0.03),
-        (LaserKind(readings=541, field=1.5 * np.pi, reach=30.0, noise=0.015), 0.02, 0.02),
-        (LaserKind(missing=0.4), 0.02, 0.03),
+        (LaserKind(readings=181, reach=8.0, step=0.3), 0.02, 0.03),
+        (LaserKind(readings=541, field=1.5 * np.pi, reach=30.0, noise=0.015, step=0.3), 0.02, 0.02),
+        (LaserKind(missing=0.4, step=0.3), 0.02, 0.03),
         (LaserKind(step=0.5, wheels=1.05), 0.02, 0.03),
-        (LaserKind(people=3), 0.1, 0.1),
+        (LaserKind(people=3, step=0.3), 0.1, 0.1),
     ],
     ids=["short range", "wide and dense", "glass", "fast, wheels", "people"],
 )

@@ -137,7 +137,7 @@ def test_what_is_no_scan_is_refused_and_the_drive_goes_on(known: SlamMap) -> Non
 
 def test_outside_the_map_odometry_goes_on_and_back_in_it_the_place_is_found(known: SlamMap) -> None:
     """The map ends at x = 50 m, and scans fit 30 m further; the vehicle goes on to 105 m, and backs up."""
-    poses = np.array([yaw_transform(25 + 80 * np.sin(np.pi * k / 130), 0.5, SENSOR_HEIGHT) for k in range(131)])
+    poses = np.array([yaw_transform(35 + 70 * np.sin(np.pi * k / 104), 0.5, SENSOR_HEIGHT) for k in range(105)])
     scans = SimulatedScans(3, world_T_lidar=poses)
     localiser = Localiser(known, poses[0], LocaliserSettings(lost_after=20.0))
     steps = [localiser.step(scans[k], time) for k, time in enumerate(scans.timestamps.tolist())]
@@ -146,7 +146,7 @@ def test_outside_the_map_odometry_goes_on_and_back_in_it_the_place_is_found(know
     assert path is not None
     off = np.linalg.norm(path[:, :3, 3] - poses[:, :3, 3], axis=1)
     lost = [step.map_T_lidar is None for step in steps]
-    assert lost[65]
+    assert lost[52]
     assert not lost[-1]
     assert off.max() < 1.0
     assert off[-10:].max() < 0.3
@@ -163,6 +163,8 @@ def test_of_two_like_streets_none_is_taken(known: SlamMap, subtests: pytest.Subt
             scans = SimulatedScans(3, world_T_lidar=poses)
             with pytest.raises(InputError, match="it is ambiguous: several places of the map look like it"):
                 localise(scans, twice)
+            if turned:
+                continue
             fixes = poses[:, :3, 3] + np.random.default_rng(0).normal(0, 1.0, (25, 3))
             fixes[:2] += 1000.0  # elsewhere at first: the place is then looked for everywhere, and is ambiguous
             by_gps = localise(scans, twice, log=SensorLog({"gps": np.column_stack([scans.timestamps, fixes])}))

@@ -111,10 +111,10 @@ def test_while_running_submaps_say_nearly_what_their_measurements_do():
 
 
 def test_one_submap_is_the_whole_graph_at_every_moment():
-    drive = Drive(square(40))
+    drive = Drive(square(27))
     settings = SubmapSettings(length=100.0, confirm_after=1, relinearise_above=1e-4)
     graph = started(drive, settings)
-    for k in range(40):
+    for k in range(27):
         drive.into(graph, range(k, k + 1))
         if k % 13 == 0:
             found = graph.finish()

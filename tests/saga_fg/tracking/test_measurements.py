@@ -266,7 +266,7 @@ def astray(ego: EgoNodeSettings | None, estimator: str, providers: tuple[Any, ..
     classes = {"default": ClassSettings(motion=ConstantVelocity(acceleration_noise=1.0), max_deviation=20.0)}
     settings = TrackerSettings(classes=classes, edges=(Following(rate=2.0),), estimator=estimator, ego=ego)
     squares = []
-    for seed in range(3):
+    for seed in range(2):
         tracker, before = Tracker(settings, providers=providers), None
         for told, place, hidden in hidden_follower(seed):
             if providers:

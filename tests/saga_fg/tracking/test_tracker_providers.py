@@ -95,7 +95,7 @@ def test_tracks_come_and_go_in_a_graph_that_stays_small(name, size):
     association = AssociationSettings(relink_above=1.0)
     settings = TrackerSettings(estimator=name, lag=0.5, association=association)
     tracker, sizes = Tracker(settings, providers=[Range()]), []
-    for k in range(60):
+    for k in range(40):
         where = CARS(0.1 * k)[[k // 20]] if k % 20 < 12 else np.empty((0, 2))
         tracker.step(frame(0.1 * k, where))
         graph = tracker.snapshot().joint[0].graph
