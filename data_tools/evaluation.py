@@ -30,6 +30,7 @@ from data_tools.metrics import (
     RecallCurves,
     SceneBoxes,
     SceneMetrics,
+    Similarity,
     best_thresholds,
     calibration,
     coverages,
@@ -42,7 +43,6 @@ from data_tools.metrics import (
     scene_metrics_by_label,
     score_sweep,
 )
-from data_tools.metrics.hota import Similarity
 from saga_fg.errors import InputError
 from saga_fg.numerics import FloatArray, IntArray, StrArray
 from saga_fg.parts import new_part, of_own_code, part_kind

@@ -9,8 +9,7 @@ import numpy as np
 from data_tools.figures import FigureTable, cell
 from data_tools.files import atomic_directory, write_text
 from data_tools.metrics import SceneMetrics, scene_metrics
-from data_tools.simulator import SimulatedTraffic, SimulatorSettings
-from data_tools.simulator.world import simulate_scene, write_tables
+from data_tools.simulator import SimulatedTraffic, SimulatorSettings, simulate_scene, write_tables
 from pipelines.config import Method, TrackConfig, load_config
 from pipelines.configuration import write_settings
 from pipelines.report import Report, report_page, scene_of_run

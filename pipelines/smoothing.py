@@ -31,10 +31,16 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.corrections import Outcomes, write_outcomes
-from data_tools.datasets.detection_files import TrackRows, write_label_table, write_review
-from data_tools.datasets.given_tracks import GivenTracks, sensor_names
-from data_tools.datasets.results import table_results
+from data_tools.datasets import (
+    GivenTracks,
+    Outcomes,
+    TrackRows,
+    sensor_names,
+    table_results,
+    write_label_table,
+    write_outcomes,
+    write_review,
+)
 from data_tools.evaluation import Evaluation, evaluate_tracks
 from data_tools.figures import write_figures
 from data_tools.files import atomic_directory
@@ -49,6 +55,7 @@ from saga_fg.model import ScoreCalibration, Sensor, sensor_model
 from saga_fg.settings import settings_group
 from saga_fg.smoothing import (
     ChunkSettings,
+    Correction,
     LabelBuilder,
     LabelCounts,
     LabelModel,
@@ -56,8 +63,8 @@ from saga_fg.smoothing import (
     RecordingLabels,
     Review,
     SmoothingSettings,
+    corrections_in,
 )
-from saga_fg.smoothing.corrections import Correction, corrections_in
 from saga_fg.types import DEFAULT, Dataset, Scene, Tracks
 
 

@@ -45,8 +45,7 @@ import numpy as np
 from data_tools.datasets.detection_files import write_rows
 from data_tools.datasets.results import SceneResult
 from data_tools.files import check_writable, parsed_json, read_lines, read_text, write_text
-from data_tools.metrics import SceneBoxes
-from data_tools.metrics.scene_boxes import near_pairs
+from data_tools.metrics import SceneBoxes, near_pairs
 from saga_fg.errors import InputError, unknown_name
 from saga_fg.numerics import BoolArray, IntArray, wrap_angle
 from saga_fg.smoothing.corrections import Correction, correction_from

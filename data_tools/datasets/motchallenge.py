@@ -34,8 +34,7 @@ from data_tools.datasets.source import (
     option,
 )
 from data_tools.files import atomic_directory, read_text, write_text
-from data_tools.metrics import SceneBoxes
-from data_tools.metrics.hota import SceneSimilarities, image_overlaps, similarity_metrics
+from data_tools.metrics import SceneBoxes, SceneSimilarities, image_overlaps, similarity_metrics
 from saga_fg.errors import InputError, error_context
 from saga_fg.model import GroundCamera
 from saga_fg.numerics import FloatArray, IntArray, refuse

@@ -1,4 +1,5 @@
-from .hota import HotaMetrics, hota_metrics
+from .hota import HotaMetrics, SceneSimilarities, Similarity, hota_metrics, image_overlaps, similarity_metrics
+from .kitti_boxes import KittiObjects, camera_boxes_to_world, has_box, world_boxes_to_camera
 from .kitti_tracking import (
     KittiSimilarity,
     KittiTrackingMetrics,
@@ -32,7 +33,7 @@ from .nuscenes_tracking import (
     score_sweep,
 )
 from .scene import FrameMatch, SceneMetrics, match_scene, scene_metrics, scene_metrics_by_label
-from .scene_boxes import SceneBoxes
+from .scene_boxes import SceneBoxes, near_pairs
 
 __all__ = [
     "EllipseCoverage",
@@ -40,6 +41,7 @@ __all__ = [
     "ErrorSummary",
     "FrameMatch",
     "HotaMetrics",
+    "KittiObjects",
     "KittiSimilarity",
     "KittiTrackingMetrics",
     "KittiTrackingSequence",
@@ -52,22 +54,30 @@ __all__ = [
     "RecallCurves",
     "SceneBoxes",
     "SceneMetrics",
+    "SceneSimilarities",
+    "Similarity",
     "best_thresholds",
     "calibration",
+    "camera_boxes_to_world",
     "coverage",
     "coverages",
     "error_summary",
     "errors_by_class",
+    "has_box",
     "hota_metrics",
+    "image_overlaps",
     "kitti_hota_metrics",
     "kitti_tracking_metrics",
     "label_errors",
     "label_velocities",
     "match_scene",
+    "near_pairs",
     "nees",
     "nuscenes_tracking_metrics",
     "placed_detections",
     "scene_metrics",
     "scene_metrics_by_label",
     "score_sweep",
+    "similarity_metrics",
+    "world_boxes_to_camera",
 ]

@@ -22,9 +22,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from data_tools.datasets.kitti.dataset import world_position
-from data_tools.datasets.mcap.recording import SUFFIXES, LoggedMessage, Recording, Topic, decoded_messages
-from data_tools.datasets.mcap.ros2_types import checked_time, frame_name, nanoseconds, xyz
-from data_tools.datasets.mcap.transforms import TRANSFORM_TYPES, TransformRecord, TransformTree, transform_records
+from data_tools.datasets.mcap import (
+    SUFFIXES,
+    TRANSFORM_TYPES,
+    LoggedMessage,
+    Recording,
+    Topic,
+    TransformRecord,
+    TransformTree,
+    checked_time,
+    decoded_messages,
+    frame_name,
+    nanoseconds,
+    transform_records,
+    xyz,
+)
 from data_tools.files import isolated
 from data_tools.laser.carmen import LaserLog, padded
 from data_tools.lidar import Columns, RecordingOptions, ScanRecording, scan_columns, scan_of_columns

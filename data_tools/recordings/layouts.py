@@ -16,10 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.kitti import KittiTracking, kitti_scans
-from data_tools.datasets.kitti.dataset import read_origin, read_transform
-from data_tools.datasets.nuscenes import nuscenes_scans
-from data_tools.datasets.nuscenes.tables import read_table, table_folder
+from data_tools.datasets.kitti import KittiTracking, kitti_scans, read_origin, read_transform
+from data_tools.datasets.nuscenes import nuscenes_scans, read_table, table_folder
 from data_tools.files import read_lines
 from data_tools.files import read_table as read_rows
 from data_tools.lidar import (

@@ -18,8 +18,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from data_tools.datasets.detection_files import write_rows
-from data_tools.datasets.source import DatasetSource, HeldScene, OpenedPart, Parts, option
+from data_tools.datasets import DatasetSource, HeldScene, OpenedPart, Parts, option, write_rows
 from data_tools.simulator.road import CAR
 from data_tools.simulator.scene_layout import SceneLayout, sample_cones, sample_layout, sample_surroundings
 from data_tools.simulator.sensed_world import (

@@ -9,9 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from data_tools.datasets.detection_files import read_tracks
-from data_tools.datasets.results import Results
-from data_tools.datasets.source import DatasetSource, Innovations, input_files
+from data_tools.datasets import DatasetSource, Innovations, Results, input_files, read_tracks
 from data_tools.evaluation import LEGEND, Evaluation
 from data_tools.figures import write_figures
 from data_tools.files import write_text, write_zip

@@ -9,16 +9,17 @@ from typing import Annotated, Literal
 
 import typer
 
-from data_tools.datasets.detection_file_source import (
+from data_tools.datasets import (
     CLASSES_TEXT,
     COLUMNS_TEXT,
     COORDINATES_TEXT,
     IMPORT_TEXT,
     SORT_TEXT,
     UNITS_TEXT,
+    TableImport,
+    TableSurvey,
+    survey_table,
 )
-from data_tools.datasets.detection_files import TableImport
-from data_tools.datasets.detection_files.dataset import TableSurvey, survey_table
 from data_tools.figures import write_figures
 from data_tools.files import check_writable
 from pipelines.cli.console import JsonFile, counted

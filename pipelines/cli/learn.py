@@ -12,8 +12,14 @@ from pipelines.cli.console import JsonFile, MarkdownFile, ReportingGroup, counte
 from pipelines.cli.options import dataset_commands
 from pipelines.config import load_config, load_interactions
 from pipelines.configuration import write_settings
-from pipelines.learning import learn_noise, learned_fragment, scenes_to_learn_from
-from pipelines.learning.interactions import learn_interactions, learned_figures, learned_tables
+from pipelines.learning import (
+    learn_interactions,
+    learn_noise,
+    learned_figures,
+    learned_fragment,
+    learned_tables,
+    scenes_to_learn_from,
+)
 
 
 def _interactions(

@@ -11,8 +11,7 @@ from typing import Annotated, Any, get_args, get_type_hints
 
 import typer
 
-from data_tools.datasets.detection_file_source import DetectionFileSource
-from data_tools.datasets.source import DatasetSource, Verb, dataset_names, dataset_source
+from data_tools.datasets import DatasetSource, DetectionFileSource, Verb, dataset_names, dataset_source
 from data_tools.files import check_writable, write_text
 from pipelines.cli.console import ReportingGroup, new_command, new_group, set_up_logging
 from pipelines.config import Method, TrackConfig, load_config, load_interactions

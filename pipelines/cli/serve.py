@@ -16,9 +16,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from data_tools.datasets.detection_file_source import LIKE_TEXT
-from data_tools.datasets.mcap.dataset import RecordingOptions
-from data_tools.datasets.mcap.source import sensor_topics
-from data_tools.datasets.mcap.transforms import DEFAULT_EGO, WORLD
+from data_tools.datasets.mcap import DEFAULT_EGO, WORLD, RecordingOptions, sensor_topics
 from pipelines.checks import Checks
 from pipelines.cli import options as how
 from pipelines.cli.options import Config, Verbose
@@ -27,6 +25,7 @@ from pipelines.config import Method, TrackConfig, load_config
 from pipelines.configuration import load_settings, write_settings
 from pipelines.explaining import clock_text
 from pipelines.serving import (
+    LogLimitFilter,
     SocketServer,
     StateKeeper,
     StopRequest,
@@ -36,7 +35,6 @@ from pipelines.serving import (
     parse_address,
     serve_pipe,
 )
-from pipelines.serving.settings import LogLimitFilter
 from pipelines.tracking import one_thread, return_large_blocks
 from saga_fg.errors import InputError
 from saga_fg.kernels.compilation import load_kernels

@@ -8,8 +8,7 @@ import typer
 
 from data_tools.datasets.nuscenes import write_nuscenes
 from data_tools.datasets.source import dataset_source
-from data_tools.simulator import SimulatedTraffic, SimulatorSettings
-from data_tools.simulator.settings import ScenarioName, scenario_settings
+from data_tools.simulator import ScenarioName, SimulatedTraffic, SimulatorSettings, scenario_settings
 from pipelines.cli.console import counted, progress_bar, show_tables, working
 from pipelines.cli.options import Config, Verbose, as_command
 from pipelines.config import Family, load_config

@@ -9,9 +9,17 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import typer
 
-from data_tools.datasets.corrections import check_classes, read_corrections, read_outcomes
-from data_tools.datasets.given_tracks import GivenTracks, TrackedRecordings, read_given_tracks, tracked_parts
-from data_tools.datasets.source import DatasetSource, input_files
+from data_tools.datasets import (
+    DatasetSource,
+    GivenTracks,
+    TrackedRecordings,
+    check_classes,
+    input_files,
+    read_corrections,
+    read_given_tracks,
+    read_outcomes,
+    tracked_parts,
+)
 from pipelines import smoothing
 from pipelines.checks import CheckedDataset, Checks, options_of
 from pipelines.cli import options
@@ -25,8 +33,7 @@ from pipelines.review import LabelRun
 from pipelines.scale_out import RunSummary, SceneTask, SmoothTask, TrackTask, file_name, new_pool, run_scenes
 from pipelines.tracking import TrackedScene, keep_predictions, track_dataset
 from saga_fg import InputError
-from saga_fg.smoothing import LabelCounts
-from saga_fg.smoothing.corrections import Correction, unfit
+from saga_fg.smoothing import Correction, LabelCounts, unfit
 from saga_fg.tracking import SensorTime
 
 FAILED_SCENES = 1  # exit code

@@ -33,16 +33,26 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from data_tools.datasets.given_tracks import detected
-from data_tools.datasets.source import DatasetSource, true_scene
+from data_tools.datasets import DatasetSource, detected, true_scene
 from data_tools.figures import FigureTable, cell
 from data_tools.metrics.scene import match_scene
 from pipelines.config import Method, TrackConfig
 from pipelines.tracking import Progress, track_scene
 from saga_fg.errors import InputError
-from saga_fg.learning import TEMPLATE, HiddenObjects, Rule, fit_interactions, hidden_objects
-from saga_fg.learning.hidden_objects import FOLLOWED
-from saga_fg.learning.labelled_scene import LENGTHS, LONGEST, Gap, LabelledScene, made_gaps, reached
+from saga_fg.learning import (
+    FOLLOWED,
+    LENGTHS,
+    LONGEST,
+    TEMPLATE,
+    Gap,
+    HiddenObjects,
+    LabelledScene,
+    Rule,
+    fit_interactions,
+    hidden_objects,
+    made_gaps,
+    reached,
+)
 from saga_fg.model import AccelerationLaw, Following, LearnedInteractions, Neighbours, Sensor
 from saga_fg.numerics import FloatArray
 from saga_fg.types import DEFAULT, Annotations, Frame, Scene, Tracks

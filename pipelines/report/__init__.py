@@ -13,19 +13,34 @@ from pipelines.report.page import (
     report_page,
     result_report,
     result_scenes,
+    with_surroundings,
 )
-from pipelines.report.scenes import ReportScene, scene_of_run
+from pipelines.report.scenes import (
+    UNMEASURED,
+    Edges,
+    ReportScene,
+    edges_of_frames,
+    latest_detections,
+    scene_data,
+    scene_of_run,
+)
 
 __all__ = [
+    "UNMEASURED",
+    "Edges",
     "Report",
     "ReportScene",
     "RunRecord",
     "drive_page",
+    "edges_of_frames",
     "latency_chart",
+    "latest_detections",
     "read_run_record",
     "record_path",
     "report_page",
     "result_report",
     "result_scenes",
+    "scene_data",
     "scene_of_run",
+    "with_surroundings",
 ]

@@ -22,10 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.detection_file_source import found_results
-from data_tools.datasets.detection_files import read_predictions
-from data_tools.datasets.results import Results, clear_figures
-from data_tools.datasets.source import DatasetSource
+from data_tools.datasets import DatasetSource, Results, clear_figures, found_results, read_predictions
 from data_tools.figures import COLOURS, Chart, FigureTable, as_json, class_colours
 from data_tools.files import parsed_json, read_bytes, write_text
 from pipelines.config import load_config

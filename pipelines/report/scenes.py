@@ -40,8 +40,7 @@ from typing import Any
 
 import numpy as np
 
-from data_tools.datasets.detection_files import PredictionRows
-from data_tools.datasets.source import AreaMap, Images
+from data_tools.datasets import AreaMap, Images, PredictionRows
 from data_tools.files import isolated
 from data_tools.metrics import SceneBoxes, best_thresholds, match_scene, score_sweep
 from pipelines.report.figures import unseen_for

@@ -14,12 +14,23 @@ from typing import Self
 
 import numpy as np
 
-from data_tools.datasets.corrections import Edits, correction_lines, write_correction_lines
-from data_tools.datasets.detection_files import read_tracks
-from data_tools.datasets.given_tracks import TrackedRecordings, read_given_tracks
-from data_tools.datasets.labelling_tools import exchanged, read_from_tool, tool_format, write_for_tool
-from data_tools.datasets.results import SceneResult, scene_result
-from data_tools.datasets.source import DatasetSource, dataset_names, dataset_source
+from data_tools.datasets import (
+    DatasetSource,
+    Edits,
+    SceneResult,
+    TrackedRecordings,
+    correction_lines,
+    dataset_names,
+    dataset_source,
+    exchanged,
+    read_from_tool,
+    read_given_tracks,
+    read_tracks,
+    scene_result,
+    tool_format,
+    write_correction_lines,
+    write_for_tool,
+)
 from data_tools.files import atomic_directory, parsed_json
 from data_tools.lidar import ScanSequence, write_cloud
 from pipelines.config import Method

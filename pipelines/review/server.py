@@ -46,16 +46,13 @@ from data_tools.datasets.corrections import (
 )
 from data_tools.files import open_text, parsed_json
 from data_tools.metrics import SceneBoxes
-from pipelines.report import Report, ReportScene, report_page
-from pipelines.report.page import with_surroundings
-from pipelines.report.scenes import scene_data
+from pipelines.report import Report, ReportScene, report_page, scene_data, with_surroundings
 from pipelines.review.exchange import LabelRun, ego_points, labelled_scenes
 from pipelines.smoothing import label_model
 from pipelines.tracking import one_thread, scene_with_frames
 from saga_fg.errors import InputError, SagaError, error_context, unknown_name
 from saga_fg.numerics import transform_points
-from saga_fg.smoothing import LabelBuilder, Review
-from saga_fg.smoothing.corrections import Correction, correction_from, corrections_in
+from saga_fg.smoothing import Correction, LabelBuilder, Review, correction_from, corrections_in
 from saga_fg.types import DEFAULT, MAX_POSITION, Scene
 
 CORRECTIONS = "corrections.jsonl"  # in the folder of labels

@@ -34,10 +34,7 @@ from pathlib import Path, PurePosixPath
 from typing import Protocol
 from urllib.parse import quote
 
-from data_tools.datasets.corrections import write_outcomes
-from data_tools.datasets.detection_files import write_label_table, write_review
-from data_tools.datasets.given_tracks import TrackedRecordings
-from data_tools.datasets.source import DatasetSource, Part
+from data_tools.datasets import DatasetSource, Part, TrackedRecordings, write_label_table, write_outcomes, write_review
 from data_tools.files import parsed_json, remove_leftovers, write_bytes
 from pipelines.config import Method, TrackConfig
 from pipelines.configuration import write_settings
@@ -47,8 +44,7 @@ from pipelines.tracking import TrackedScene, keep_predictions, track_dataset
 from saga_fg import Dataset
 from saga_fg.errors import InputError
 from saga_fg.numerics import FloatArray
-from saga_fg.smoothing import LabelCounts
-from saga_fg.smoothing.corrections import Correction
+from saga_fg.smoothing import Correction, LabelCounts
 
 
 class OutputFolder:

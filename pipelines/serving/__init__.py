@@ -9,12 +9,13 @@
 
 from pipelines.serving.messages import StreamClient
 from pipelines.serving.server import SocketServer, StopRequest, serve_pipe
-from pipelines.serving.settings import Address, StreamSettings, parse_address
+from pipelines.serving.settings import Address, LogLimitFilter, StreamSettings, parse_address
 from pipelines.serving.state import StateKeeper
 from pipelines.serving.stream import StreamTracker
 
 __all__ = [
     "Address",
+    "LogLimitFilter",
     "SocketServer",
     "StateKeeper",
     "StopRequest",

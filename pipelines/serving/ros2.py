@@ -23,11 +23,23 @@ from typing import Any, Literal
 
 import numpy as np
 
-from data_tools.datasets.mcap.dataset import RecordingOptions, message_content, placed_frames
-from data_tools.datasets.mcap.objects import OBJECT_TYPES, RESULTS, MessageObjects, message_objects
-from data_tools.datasets.mcap.recording import LoggedMessage
-from data_tools.datasets.mcap.ros2_types import decoder, encoded
-from data_tools.datasets.mcap.transforms import HOLD, ODOMETRY_TYPES, WORLD, TransformBuffer, find_places
+from data_tools.datasets.mcap import (
+    HOLD,
+    OBJECT_TYPES,
+    ODOMETRY_TYPES,
+    RESULTS,
+    WORLD,
+    LoggedMessage,
+    MessageObjects,
+    RecordingOptions,
+    TransformBuffer,
+    decoder,
+    encoded,
+    find_places,
+    message_content,
+    message_objects,
+    placed_frames,
+)
 from data_tools.files import one_line
 from pipelines.serving.messages import FrameMessage
 from pipelines.serving.ros2_network import Ros2Network

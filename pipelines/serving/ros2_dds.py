@@ -13,8 +13,7 @@ from collections.abc import Callable, Collection, Mapping
 from functools import cache, partial
 from typing import Any
 
-from data_tools.datasets.mcap.recording import LoggedMessage
-from data_tools.datasets.mcap.ros2_types import fields_of, plain_type
+from data_tools.datasets.mcap import LoggedMessage, fields_of, plain_type
 from pipelines.serving.ros2_network import DEPTH, PUBLISHED_DEPTH, TRANSIENT, Ros2Network
 from saga_fg.errors import InputError, MissingExtraError
 

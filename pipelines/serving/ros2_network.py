@@ -9,8 +9,7 @@ import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
 
-from data_tools.datasets.mcap.recording import LoggedMessage, Topic
-from data_tools.datasets.mcap.ros2_types import plain_type
+from data_tools.datasets.mcap import LoggedMessage, Topic, plain_type
 
 log = logging.getLogger(__name__)
 

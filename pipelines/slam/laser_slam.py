@@ -17,8 +17,17 @@ from typing import Annotated
 
 import numpy as np
 
-from data_tools.laser import LaserLog, check_wheels, warn_of_times, without_jumps
-from data_tools.laser.mapping import SMEAR, Fit, LineMap, ScoreGrid, thinned
+from data_tools.laser import (
+    SMEAR,
+    Fit,
+    LaserLog,
+    LineMap,
+    ScoreGrid,
+    check_wheels,
+    thinned,
+    warn_of_times,
+    without_jumps,
+)
 from data_tools.lidar import Scan, Submap
 from pipelines.slam.drive import motion
 from pipelines.slam.driver import FrontEnd, Slam
@@ -41,10 +50,8 @@ from saga_fg.numerics import (
     vector,
 )
 from saga_fg.settings import Positive, Range, Settings, setting
-from saga_fg.slam.pose_graph import PoseGraph, consensus, trusted
-from saga_fg.slam.pose_graph.optimisation import chosen_edges
-from saga_fg.slam.submaps import LoopClosure, SubmapSettings
-from saga_fg.slam.submaps.between import Motion
+from saga_fg.slam.pose_graph import PoseGraph, chosen_edges, consensus, trusted
+from saga_fg.slam.submaps import LoopClosure, Motion, SubmapSettings
 
 _FLOOR = np.array([0.01, 0.01, 0.002]) ** 2  # variance of a registration of any number of points, m^2 and rad^2
 _DETERMINED = 0.05  # ratio of information along and across below which a place is a bare corridor

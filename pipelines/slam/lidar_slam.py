@@ -31,8 +31,7 @@ from saga_fg.model import LandmarkDetector, PlaneLandmark, PoleLandmark
 from saga_fg.numerics import FloatArray, inverse_transform
 from saga_fg.providers import OdometryNoise
 from saga_fg.settings import Positive, Settings, setting, settings_group
-from saga_fg.slam.joint import JointSettings, OdometryIncrements, estimate_jointly
-from saga_fg.slam.joint.record import KEYFRAME_PERIOD, in_ego
+from saga_fg.slam.joint import KEYFRAME_PERIOD, JointSettings, OdometryIncrements, estimate_jointly, in_ego
 from saga_fg.slam.mapping import LandmarkObservations
 from saga_fg.slam.sensors import sensor_providers
 from saga_fg.slam.submaps import Loops, SubmapSettings

@@ -26,8 +26,7 @@ from saga_fg import InputError
 from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import EGO_BIAS, EGO_POSE, EGO_VELOCITY, FactorProvider
 from saga_fg.numerics import FloatArray, carried_covariance, checked_transform, inverse_transform, yaw_transform
-from saga_fg.providers import Imu, Wheels
-from saga_fg.providers.vehicle_sensors import GRAVITY, mounting, on_pose
+from saga_fg.providers import GRAVITY, Imu, Wheels, mounting, on_pose
 from saga_fg.slam.sensors import SensorConsistency, SensorName, SensorSettings, sensor_providers
 from saga_fg.types import Detections, EgoMeasurements, Frame, ImuSamples, WheelSpeed
 

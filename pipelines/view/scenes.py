@@ -51,8 +51,7 @@ from data_tools.files import parsed_json, read_bytes
 from data_tools.lidar import Scan, ScanSequence, read_scan, voxel_downsample
 from data_tools.metrics import SceneBoxes
 from data_tools.trajectories import Trajectory, read_tum_poses
-from pipelines.report.page import result_scenes
-from pipelines.report.scenes import UNMEASURED, Edges, ReportScene, edges_of_frames, latest_detections
+from pipelines.report import UNMEASURED, Edges, ReportScene, edges_of_frames, latest_detections, result_scenes
 from saga_fg import Boxes, InputError
 from saga_fg.numerics import FloatArray, IntArray, checked
 

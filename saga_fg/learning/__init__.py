@@ -1,6 +1,6 @@
 """Learn from recordings: noise, scores and detection probability of sensors, process noise, and interactions."""
 
-from saga_fg.learning.hidden_objects import GapPrediction, HiddenObjects, hidden_objects
+from saga_fg.learning.hidden_objects import FOLLOWED, GapPrediction, HiddenObjects, hidden_objects
 from saga_fg.learning.interaction_fit import (
     MAX_GAPS,
     TEMPLATE,
@@ -11,12 +11,18 @@ from saga_fg.learning.interaction_fit import (
 )
 from saga_fg.learning.labelled_scene import (
     GATE,
+    LENGTHS,
+    LONGEST,
     DetectionSample,
+    Gap,
+    LabelledScene,
     MatchedFrame,
     SampledDetections,
     SampledObjects,
+    made_gaps,
     match_to_truth,
     measured_trajectories,
+    reached,
     sample_with_truth,
 )
 from saga_fg.learning.process_noise import (
@@ -36,14 +42,19 @@ from saga_fg.learning.sensor_fit import (
 from saga_fg.learning.trajectory_noise import DetectedTrajectory, fit_trajectory_noise, sample_with_tracker
 
 __all__ = [
+    "FOLLOWED",
     "GATE",
+    "LENGTHS",
+    "LONGEST",
     "MAX_GAPS",
     "TEMPLATE",
     "DetectedTrajectory",
     "DetectionSample",
     "FittedInteractions",
+    "Gap",
     "GapPrediction",
     "HiddenObjects",
+    "LabelledScene",
     "MatchedFrame",
     "MeasuredTrajectory",
     "Rule",
@@ -61,9 +72,11 @@ __all__ = [
     "hidden_objects",
     "learn_confusion",
     "learn_sizes",
+    "made_gaps",
     "match_to_truth",
     "measured_trajectories",
     "negative_log_likelihood",
+    "reached",
     "sample_with_tracker",
     "sample_with_truth",
 ]

@@ -8,9 +8,10 @@ Each reads what a frame brings (`Frame.ego`) and works in the running graph wher
 
 from saga_fg.providers.odometry import Odometry, OdometryNoise, StartSettings
 from saga_fg.providers.surroundings import Landmarks, LaneKeeping, RelativeDetections
-from saga_fg.providers.vehicle_sensors import Gps, Imu, Wheels
+from saga_fg.providers.vehicle_sensors import GRAVITY, Gps, Imu, Wheels, mounting, on_pose
 
 __all__ = [
+    "GRAVITY",
     "Gps",
     "Imu",
     "Landmarks",
@@ -20,4 +21,6 @@ __all__ = [
     "RelativeDetections",
     "StartSettings",
     "Wheels",
+    "mounting",
+    "on_pose",
 ]

@@ -55,8 +55,7 @@ from factors import (
 from factors.manifolds import central_differences
 from saga_fg.errors import InputError
 from saga_fg.estimators import GraphSolution
-from saga_fg.graph import EGO_POSE, LANDMARK, Additions, GraphView, NewVariable, key_of
-from saga_fg.graph.factor_checks import Factor
+from saga_fg.graph import EGO_POSE, LANDMARK, Additions, Factor, GraphView, NewVariable, key_of
 from saga_fg.numerics import FloatArray, IntArray, assign, gate
 from saga_fg.types import Landmark, LandmarkType, Observation
 

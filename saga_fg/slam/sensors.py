@@ -27,8 +27,7 @@ import numpy as np
 from saga_fg.errors import InputError
 from saga_fg.graph import EGO_BIAS, Additions, FactorProvider, GraphView, SceneFactorGraph
 from saga_fg.numerics import FloatArray, checked
-from saga_fg.providers import Gps, Imu, StartSettings, Wheels
-from saga_fg.providers.vehicle_sensors import on_pose
+from saga_fg.providers import Gps, Imu, StartSettings, Wheels, on_pose
 from saga_fg.settings import Settings, settings_group
 from saga_fg.types import EgoMeasurements, GpsFix, ImuSamples, WheelSpeed
 

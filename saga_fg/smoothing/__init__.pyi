@@ -21,6 +21,7 @@ from .boxes import (
     smooth_walks,
     weighted_medians,
 )
+from .corrections import Correction, correction_from, corrections_in, unfit
 from .doubt import Review
 from .labelling import RecordingLabels
 from .recording import ChunkSettings, LabelBuilder, LabelModel, smooth
@@ -43,6 +44,7 @@ from .states import (
 
 __all__ = [
     "ChunkSettings",
+    "Correction",
     "Evidence",
     "EvidenceFrame",
     "Headings",
@@ -65,6 +67,8 @@ __all__ = [
     "assign_detections",
     "assign_free_detections",
     "constant_sizes",
+    "correction_from",
+    "corrections_in",
     "evidence_scores",
     "frame_rate",
     "gather_evidence",
@@ -83,5 +87,6 @@ __all__ = [
     "smooth_walks",
     "stationary_states",
     "stitch_tracklets",
+    "unfit",
     "weighted_medians",
 ]

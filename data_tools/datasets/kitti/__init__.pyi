@@ -1,4 +1,13 @@
-from .dataset import Calibration, KittiTracking, kitti_scans, local_kitti, read_calibration, read_poses
+from .dataset import (
+    Calibration,
+    KittiTracking,
+    kitti_scans,
+    local_kitti,
+    read_calibration,
+    read_origin,
+    read_poses,
+    read_transform,
+)
 from .labels import image_boxes, observation_angles, read_kitti_labels
 from .source import kitti_result_text, write_kitti_results
 
@@ -12,6 +21,8 @@ __all__ = [
     "observation_angles",
     "read_calibration",
     "read_kitti_labels",
+    "read_origin",
     "read_poses",
+    "read_transform",
     "write_kitti_results",
 ]

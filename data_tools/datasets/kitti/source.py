@@ -66,18 +66,21 @@ from data_tools.evaluation import Evaluation, HotaRow, mean_scores
 from data_tools.figures import Column, FigureTable
 from data_tools.files import atomic_directory, is_url
 from data_tools.metrics import (
+    KittiObjects,
     KittiSimilarity,
     KittiTrackingMetrics,
     KittiTrackingSequence,
     LabelErrors,
     SceneBoxes,
+    camera_boxes_to_world,
+    has_box,
     kitti_hota_metrics,
     kitti_tracking_metrics,
     label_errors,
     label_velocities,
     placed_detections,
+    world_boxes_to_camera,
 )
-from data_tools.metrics.kitti_boxes import KittiObjects, camera_boxes_to_world, has_box, world_boxes_to_camera
 from saga_fg.errors import InputError, error_context, unknown_name
 from saga_fg.numerics import FloatArray, IntArray, inverse_transform
 from saga_fg.types import Scene, Tracks, known_velocities

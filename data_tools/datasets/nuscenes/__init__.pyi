@@ -6,7 +6,14 @@ from .results import (
     write_tracking_results,
 )
 from .source import ScoredScene, read_scored_scenes
-from .tables import CATEGORY_TO_TRACKING_CLASS, DETECTION_CLASSES, TRACKING_CLASSES, split_scenes
+from .tables import (
+    CATEGORY_TO_TRACKING_CLASS,
+    DETECTION_CLASSES,
+    TRACKING_CLASSES,
+    read_table,
+    split_scenes,
+    table_folder,
+)
 from .writer import write_nuscenes
 
 __all__ = [
@@ -19,8 +26,10 @@ __all__ = [
     "merge_tracking_results",
     "nuscenes_scans",
     "read_scored_scenes",
+    "read_table",
     "read_tracking_results",
     "split_scenes",
+    "table_folder",
     "write_nuscenes",
     "write_tracking_results",
 ]

@@ -1,7 +1,7 @@
 """Pose graphs: the type, a start that needs no guess, their optimisation and its proof."""
 
 from saga_fg.slam.pose_graph.certificate import ChordalMinimum, chordal_minimum
-from saga_fg.slam.pose_graph.chordal import ChordalCost, chordal_poses, nearest_rotations
+from saga_fg.slam.pose_graph.chordal import ChordalCost, chordal_poses, factorised, nearest_rotations
 from saga_fg.slam.pose_graph.graph import (
     PointLandmarks,
     PoseGraph,
@@ -10,17 +10,21 @@ from saga_fg.slam.pose_graph.graph import (
     trusted,
 )
 from saga_fg.slam.pose_graph.optimisation import (
+    SOLVER,
     Consensus,
     OptimisedPoses,
+    chosen_edges,
     consensus,
     factor_graph,
     graph_error,
+    graph_values,
     optimise_poses,
     pose_array,
     pose_values,
 )
 
 __all__ = [
+    "SOLVER",
     "ChordalCost",
     "ChordalMinimum",
     "Consensus",
@@ -31,9 +35,12 @@ __all__ = [
     "PositionPriors",
     "chordal_minimum",
     "chordal_poses",
+    "chosen_edges",
     "consensus",
     "factor_graph",
+    "factorised",
     "graph_error",
+    "graph_values",
     "nearest_rotations",
     "optimise_poses",
     "pose_array",

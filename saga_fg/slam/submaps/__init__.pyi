@@ -1,10 +1,11 @@
-from .between import LoopClosure, Loops, LoopSelection, drive_graph, loop_factors, select_loops
+from .between import LoopClosure, Loops, LoopSelection, Motion, drive_graph, loop_factors, select_loops
 from .graph import SolvedDrive, SubmapGraph, SubmapSettings
 
 __all__ = [
     "LoopClosure",
     "LoopSelection",
     "Loops",
+    "Motion",
     "SolvedDrive",
     "SubmapGraph",
     "SubmapSettings",

@@ -47,10 +47,7 @@ from scipy.sparse import coo_array
 
 from factors import Robust, Solution, Variable, between_factor, residual_factor, solve
 from saga_fg.errors import InputError
-from saga_fg.graph import Additions, GraphView
-from saga_fg.graph.factor_checks import Factor, stacked
-from saga_fg.graph.factor_groups import PriorGroup
-from saga_fg.graph.variables import LinearisationPoint
+from saga_fg.graph import Additions, Factor, GraphView, LinearisationPoint, PriorGroup, stacked
 from saga_fg.numerics import (
     BoolArray,
     FloatArray,
@@ -61,9 +58,16 @@ from saga_fg.numerics import (
     inverse_transform,
 )
 from saga_fg.slam.mapping import pose_key
-from saga_fg.slam.pose_graph import PoseGraph, PosePriors, consensus, factor_graph
-from saga_fg.slam.pose_graph.chordal import factorised
-from saga_fg.slam.pose_graph.optimisation import SOLVER, chosen_edges, graph_values
+from saga_fg.slam.pose_graph import (
+    SOLVER,
+    PoseGraph,
+    PosePriors,
+    chosen_edges,
+    consensus,
+    factor_graph,
+    factorised,
+    graph_values,
+)
 
 _MIN_ROOT = 1e-3  # root of the information that counts as none: a deviation of 1000 m or rad
 
