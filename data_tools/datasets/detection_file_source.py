@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,6 +26,7 @@ from data_tools.datasets.source import (
     ChosenScenes,
     DatasetSource,
     OpenedPart,
+    Part,
     Parts,
     Verb,
     file_digest,
@@ -182,7 +183,7 @@ class DetectionFileSource(DatasetSource):
         if not self.detections:
             yield Parts((), (), NoScenes())
             return
-        parts = [DetectionFilePart(url, self.how_detections) for url in expanded(self.detections or ())]
+        parts = [table_part(url, self.how_detections) for url in expanded(self.detections or ())]
         yield Parts([part.name for part in parts], parts)
 
     @contextmanager
@@ -290,23 +291,16 @@ class DetectedTruth:
         )
 
 
-@dataclass(frozen=True)
-class DetectionFilePart:
-    """A table of detections, a local file or one that fsspec can open by its URL, read at the worker."""
+def table_part(url: str, how: TableImport) -> Part:
+    """A table of detections, a local file or one that fsspec can open by its URL, named without its suffix."""
+    return Part(Path(name_of(url)).stem, partial(_opened_table, url, how))
 
-    url: str
-    how: TableImport = field(default_factory=TableImport)
 
-    @property
-    def name(self) -> str:
-        """The name of the file without its suffix."""
-        return Path(name_of(self.url)).stem
-
-    @contextmanager
-    def opened(self) -> Iterator[OpenedPart]:
-        """Open with the digest of the file."""
-        with local_copy(self.url) as path:
-            yield OpenedPart({name_of(self.url): file_digest(path)}, lambda: read_detections(path, self.how))
+@contextmanager
+def _opened_table(url: str, how: TableImport) -> Iterator[OpenedPart]:
+    """Open a table with the digest of the file."""
+    with local_copy(url) as path:
+        yield OpenedPart({name_of(url): file_digest(path)}, lambda: read_detections(path, how))
 
 
 _DEPTH = 6  # callers between a warning and the program

@@ -10,6 +10,7 @@ Recordings that have ground truth and no detections take these from a table, or 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -123,28 +124,16 @@ class TrackedRecordings:
         return with_tracks(of_scene(self.results, name), own)
 
 
-@dataclass(frozen=True, eq=False)
-class TrackedPart:
-    """A part of a dataset with the boxes of results; read where it is needed."""
-
-    part: Part
-    results: GivenTracks
-
-    @property
-    def name(self) -> str:
-        """That of the part."""
-        return self.part.name
-
-    @contextmanager
-    def opened(self) -> Iterator[OpenedPart]:
-        """Open with the digests of the results too."""
-        given = {
-            f"{SENSOR} {name} {number}": _digest(each)
-            for number, result in enumerate(self.results)
-            for name, each in result.items()
-        }
-        with self.part.opened() as part:
-            yield OpenedPart({**part.digests, **given}, lambda: TrackedRecordings(part.read(), self.results))
+@contextmanager
+def _opened(part: Part, results: GivenTracks) -> Iterator[OpenedPart]:
+    """Open a part of a dataset with the boxes of results, and their digests too."""
+    given = {
+        f"{SENSOR} {name} {number}": _digest(each)
+        for number, result in enumerate(results)
+        for name, each in result.items()
+    }
+    with part.opened() as there:
+        yield OpenedPart({**there.digests, **given}, lambda: TrackedRecordings(there.read(), results))
 
 
 def _digest(result: SceneResult) -> str:
@@ -156,13 +145,13 @@ def tracked_parts(parts: Parts, results: GivenTracks) -> Parts:
     """The parts of a dataset with the boxes of results; parts that are one scene each, and these if there is none."""
     there = dict.fromkeys(name for result in results for name in result)
     if not parts.names:
-        return Parts([*there], (HeldScene(with_tracks(of_scene(results, name))) for name in there), parts.dataset)
+        return Parts([*there], (HeldScene(with_tracks(of_scene(results, name))).part for name in there), parts.dataset)
 
     def chosen() -> Iterator[Part]:
         for part in parts.parts:
             if part.name in there:
                 own = [{name: result[name] for name in [part.name] if name in result} for result in results]
-                yield TrackedPart(part, own)
+                yield Part(part.name, partial(_opened, part, own))
 
     return Parts([name for name in parts.names if name in there], chosen(), parts.dataset)
 

@@ -35,8 +35,9 @@ import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, cast
 
 import numpy as np
 
@@ -82,15 +83,16 @@ class OpenedPart:
     read: Callable[[], Dataset]
 
 
-class Part(Protocol):
-    """One scene, or a file of several, that is sent to a worker by pickling."""
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One scene, or a file of several, that is sent to a worker by pickling.
 
-    @property
-    def name(self) -> str:
-        """Unique within a run; results and the manifest are named for it."""
+    name    unique within a run; results and the manifest are named for it
+    opened  makes the part available for the length of a block; raises `InputError` where it is not
+    """
 
-    def opened(self) -> AbstractContextManager[OpenedPart]:
-        """Make the part available for the length of a block; raises `InputError` where it is not."""
+    name: str
+    opened: Callable[[], AbstractContextManager[OpenedPart]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +113,9 @@ class HeldScene:
     meta: Any = None
 
     @property
-    def name(self) -> str:
-        return self.held.name
+    def part(self) -> Part:
+        """The scene to be sent."""
+        return Part(self.held.name, self.opened)
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -155,22 +158,15 @@ def scene_digests(scene: Scene) -> dict[str, str]:
     return digests
 
 
-@dataclass(frozen=True)
-class SourcePart:
-    """A recording of a dataset, opened and read at the worker; the dataset says which `files` it is read from."""
-
-    source: DatasetSource
-    name: str
-
-    @contextmanager
-    def opened(self) -> Iterator[OpenedPart]:
-        """Open with the digests of its files, and the settings among the options."""
-        settings = {field.name: getattr(self.source, field.name) for field in fields(self.source)}
-        texts = {name: repr(value) for name, value in settings.items() if is_dataclass(value)}
-        with self.source.open() as dataset:
-            files: Iterable[Path] = dataset.files(self.name)  # type: ignore[attr-defined]
-            digests = {f"{path.parent.name}/{path.name}": file_digest(path) for path in files}
-            yield OpenedPart({**digests, **texts}, lambda: dataset)
+@contextmanager
+def opened_recording(source: DatasetSource, name: str) -> Iterator[OpenedPart]:
+    """Open one recording, with the digests of the `files` that the dataset reads it from, and settings of options."""
+    settings = {field.name: getattr(source, field.name) for field in fields(source)}
+    texts = {name: repr(value) for name, value in settings.items() if is_dataclass(value)}
+    with source.open() as dataset:
+        files: Iterable[Path] = dataset.files(name)  # type: ignore[attr-defined]
+        digests = {f"{path.parent.name}/{path.name}": file_digest(path) for path in files}
+        yield OpenedPart({**digests, **texts}, lambda: dataset)
 
 
 def file_digest(path: Path) -> str:
@@ -374,9 +370,11 @@ class DatasetSource:
         with self.open() as dataset:
             scenes = dataset.scenes
             if callable(getattr(dataset, "files", None)):
-                yield Parts(scenes, (SourcePart(self.restricted([name]), name) for name in scenes))
+                yield Parts(
+                    scenes, (Part(name, partial(opened_recording, self.restricted([name]), name)) for name in scenes)
+                )
             else:
-                yield Parts(scenes, (HeldScene(dataset.scene(name)) for name in scenes), dataset)
+                yield Parts(scenes, (HeldScene(dataset.scene(name)).part for name in scenes), dataset)
 
     def stream(self) -> AbstractContextManager[Iterator[Scene]] | None:
         """Recordings as successive parts of scenes, to smooth them while they are read; None to hold each in memory."""

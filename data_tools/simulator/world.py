@@ -18,7 +18,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from data_tools.datasets import DatasetSource, HeldScene, OpenedPart, Parts, option, write_rows
+from data_tools.datasets import DatasetSource, HeldScene, OpenedPart, Part, Parts, option, write_rows
 from data_tools.simulator.road import CAR
 from data_tools.simulator.scene_layout import SceneLayout, sample_cones, sample_layout, sample_surroundings
 from data_tools.simulator.sensed_world import (
@@ -247,25 +247,16 @@ class SimulatedSource(DatasetSource):
     @contextmanager
     def parts(self) -> Iterator[Parts]:
         scenes = SimulatedTraffic(self.simulator, self.scenes, self.seed).scenes
-        yield Parts(scenes, (SimulatedScene(self, name) for name in scenes))
+        yield Parts(scenes, (Part(name, partial(opened_scene, self, name)) for name in scenes))
 
 
-@dataclass(frozen=True)
-class SimulatedScene:
-    """Scene `name` of simulated traffic, made at the worker."""
-
-    source: SimulatedSource
-    name: str
-
-    @contextmanager
-    def opened(self) -> Iterator[OpenedPart]:
-        """Open with the digest of the settings, seed and name."""
-        made_from = f"{self.source.simulator or SimulatorSettings()!r} {self.source.seed} {self.name}"
-        yield OpenedPart({"simulator": hashlib.sha256(made_from.encode()).hexdigest()}, self._read)
-
-    def _read(self) -> Dataset:
-        source = self.source
-        return HeldScene(SimulatedTraffic(source.simulator, source.scenes, source.seed).scene(self.name))
+@contextmanager
+def opened_scene(source: SimulatedSource, name: str) -> Iterator[OpenedPart]:
+    """Open one scene, which is made at the worker, with the digest of the settings, seed and name."""
+    made_from = f"{source.simulator or SimulatorSettings()!r} {source.seed} {name}"
+    traffic = SimulatedTraffic(source.simulator, source.scenes, source.seed)
+    digests = {"simulator": hashlib.sha256(made_from.encode()).hexdigest()}
+    yield OpenedPart(digests, lambda: HeldScene(traffic.scene(name)))
 
 
 BOX = ("x", "y", "z", "length", "width", "height", "yaw", "vx", "vy")

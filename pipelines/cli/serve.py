@@ -1,7 +1,5 @@
 """`saga-fg serve` and `saga-fg status`: live tracking as a service."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

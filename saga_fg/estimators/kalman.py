@@ -301,17 +301,12 @@ class JointKalmanFilter(Estimator):
     def add(
         self, nodes: ArrayLike, means: ArrayLike, covariances: ArrayLike, labels: Mapping[int, str] | None = None
     ) -> None:
-        self._add(nodes, *checked_prior(nodes, means, covariances), labels)
+        self.add_unchecked(np.asarray(nodes), *checked_prior(nodes, means, covariances), labels)
 
     def add_unchecked(
         self, nodes: IntArray, means: FloatArray, covariances: FloatArray, labels: Mapping[int, str] | None = None
     ) -> None:
-        self._add(nodes, means, covariances, labels)
-
-    def _add(
-        self, nodes: ArrayLike, mean: FloatArray, covariance: FloatArray, labels: Mapping[int, str] | None
-    ) -> None:
-        self._state = self._state.extended(self._state.layout.extended(nodes, mean.shape[1]), mean, covariance)
+        self._state = self._state.extended(self._state.layout.extended(nodes, means.shape[1]), means, covariances)
         if self.providers:
             self._auxiliary = replace(self._auxiliary, labels={**self._auxiliary.labels, **(labels or {})})
 

@@ -28,8 +28,6 @@ so that factors linearised at different points speak of the same unknowns: exact
 with the gradient and the covariance that factors linearised there have in GTSAM's own coordinates.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -16,8 +16,6 @@ Quantiles of the chi-square distribution: gates, and ellipses that hold a given 
 `scipy.stats` has them, too, and takes half a second to import, which every start of the command would pay.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Self

@@ -33,8 +33,6 @@ Sources: Blackman and Popoli, Design and Analysis of Modern Tracking Systems, 19
 Transactions on Aerospace and Electronic Systems 50(4), 2014: marginals by belief propagation.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple

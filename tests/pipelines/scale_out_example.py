@@ -8,7 +8,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from data_tools.datasets.detection_file_source import DetectionFilePart, DetectionFileSource
+from data_tools.datasets.detection_file_source import DetectionFileSource, table_part
+from data_tools.datasets.detection_files import TableImport
+from data_tools.datasets.source import Part
 from pipelines.config import load_config
 from pipelines.scale_out import Job, Outcome, TrackTask, perform
 from saga_fg.types.dataset import Dataset
@@ -17,7 +19,7 @@ CONFIG = load_config("file")
 TRACK = TrackTask(CONFIG, "saga", DetectionFileSource())
 
 
-def write_recordings(folder: Path, count: int, rows: int = 15) -> list[DetectionFilePart]:
+def write_recordings(folder: Path, count: int, rows: int = 15) -> list[Part]:
     """Files `a00.csv`, `a01.csv`, ..., each with two cars side by side, faster ones in later files."""
     folder.mkdir(exist_ok=True)
     for number in range(count):
@@ -26,7 +28,7 @@ def write_recordings(folder: Path, count: int, rows: int = 15) -> list[Detection
             x = k * (0.5 + 0.1 * number)
             lines += [f"{k / 10},car,{x},0.0,0.9", f"{k / 10},car,{x + 0.3},4.0,0.8"]
         (folder / f"a{number:02d}.csv").write_text("\n".join(lines) + "\n")
-    return [DetectionFilePart(str(path)) for path in sorted(folder.glob("*.csv"))]
+    return [table_part(str(path), TableImport()) for path in sorted(folder.glob("*.csv"))]
 
 
 def content(output: Path) -> dict[str, bytes]:

@@ -20,7 +20,7 @@ import pytest
 from data_tools.datasets.nuscenes import read_tracking_results
 from data_tools.datasets.source import HeldScene, Part
 from data_tools.simulator import SimulatorSettings
-from data_tools.simulator.world import SimulatedScene, SimulatedSource
+from data_tools.simulator.world import SimulatedSource, opened_scene
 from pipelines.scale_out import (
     Job,
     LocalPool,
@@ -144,7 +144,8 @@ def test_a_scene_that_kills_every_worker_fails_alone(tmp_path):
 def test_simulated_scenes_are_made_at_the_worker(tmp_path):
     settings = SimulatorSettings(duration=1.0, warm_up=2.0)
     source = SimulatedSource(simulator=settings, scenes=2, seed=7)
-    inputs = [SimulatedScene(source, f"scene-000{k}") for k in (1, 2)]
+    with source.parts() as parts:
+        inputs = list(parts.parts)
     run(inputs, tmp_path / "parallel", workers=2)
     run(inputs, tmp_path / "serial")
     assert content(tmp_path / "parallel") == content(tmp_path / "serial")
@@ -154,14 +155,13 @@ def test_simulated_scenes_are_made_at_the_worker(tmp_path):
 
 def test_a_held_scene_is_known_by_all_it_holds():
     settings = SimulatorSettings(duration=1.0, warm_up=2.0)
-    source = SimulatedScene(SimulatedSource(simulator=settings, scenes=1, seed=7), "scene-0001")
-    with source.opened() as at:
+    with opened_scene(SimulatedSource(simulator=settings, scenes=1, seed=7), "scene-0001") as at:
         scene = at.read().scene("scene-0001")
-    known = perform(Job(HeldScene(scene), TRACK)).digests
+    known = perform(Job(HeldScene(scene).part, TRACK)).digests
     assert set(known) == {"moments", "lidar", "camera"}
-    assert perform(Job(HeldScene(scene), TRACK, known)).status == "unchanged"
+    assert perform(Job(HeldScene(scene).part, TRACK, known)).status == "unchanged"
     shorter = replace(scene, frames=[frame for frame in scene.frames if frame is not scene.frames[-1]])
-    changed = perform(Job(HeldScene(shorter), TRACK, known))
+    changed = perform(Job(HeldScene(shorter).part, TRACK, known))
     assert changed.status == "done"
     assert sum(changed.digests[name] != known[name] for name in known) == 1
 

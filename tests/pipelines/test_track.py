@@ -13,7 +13,7 @@ import pytest
 from data_tools.datasets.kitti import local_kitti
 from data_tools.datasets.kitti.source import KittiSource
 from data_tools.datasets.nuscenes import NuScenes, read_tracking_results
-from data_tools.datasets.source import SourcePart
+from data_tools.datasets.source import opened_recording
 from data_tools.files.file_access import local_tree
 from data_tools.simulator import SimulatorSettings
 from pipelines.checks import Checks
@@ -362,10 +362,10 @@ def test_a_worker_fetches_its_sequence_alone(tmp_path, put):
     with local_kitti(url, f"{url}/found", ["0008"]) as dataset:
         assert dataset.scenes == ("0008",)
         assert [path.name for path in dataset.files("0008")[0].parent.iterdir()] == ["0008.txt"]
-    with SourcePart(KittiSource(dataroot=url, detections=f"{url}/found", scenes="0007"), "0007").opened() as there:
+    with opened_recording(KittiSource(dataroot=url, detections=f"{url}/found", scenes="0007"), "0007") as there:
         digests = there.digests
     local = KittiSource(dataroot=str(root), detections=str(root / "found"), scenes="0007")
-    with SourcePart(local, "0007").opened() as here:
+    with opened_recording(local, "0007") as here:
         assert digests == here.digests
 
 

@@ -8,6 +8,7 @@ The topic is `/saga_fg/tracks`, the frame the one that was tracked in, the times
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Self
@@ -27,6 +28,7 @@ from data_tools.datasets.source import (
     DatasetSource,
     HeldScene,
     OpenedPart,
+    Part,
     Parts,
     ResultFormat,
     TrackedScenes,
@@ -176,7 +178,7 @@ class McapSource(DatasetSource):
 
     @contextmanager
     def parts(self) -> Iterator[Parts]:
-        parts = [McapPart(replace(self, recording=[path])) for path in self.recording or ()]
+        parts = [recording_part(replace(self, recording=[path]), Path(path)) for path in self.recording or ()]
         yield Parts([part.name for part in parts], parts)
 
     def kept(self) -> Mapping[str, Any]:
@@ -237,22 +239,15 @@ def sensor_topics(option: str, values: Iterable[str]) -> dict[str, str]:
     return topics
 
 
-@dataclass(frozen=True)
-class McapPart:
-    """A recording, read at the worker."""
+def recording_part(source: McapSource, path: Path) -> Part:
+    """A recording, by the name of the file without its suffix, or of the folder."""
+    return Part(path.stem if path.suffix in (".mcap", ".db3") else path.name, partial(_opened, source))
 
-    source: McapSource
 
-    @property
-    def name(self) -> str:
-        """The name of the file without its suffix, or of the folder."""
-        path = Path((self.source.recording or [""])[0])
-        return path.stem if path.suffix in (".mcap", ".db3") else path.name
-
-    @contextmanager
-    def opened(self) -> Iterator[OpenedPart]:
-        """Open with the digests of the files, and of the options."""
-        dataset = self.source.recorded()
-        digests = {file.name: file_digest(file) for file in dataset.files}
-        options = sha256(repr(dataset.options).encode()).hexdigest()
-        yield OpenedPart({**digests, "options": options}, lambda: dataset)
+@contextmanager
+def _opened(source: McapSource) -> Iterator[OpenedPart]:
+    """Open the one recording with the digests of the files, and of the options."""
+    dataset = source.recorded()
+    digests = {file.name: file_digest(file) for file in dataset.files}
+    options = sha256(repr(dataset.options).encode()).hexdigest()
+    yield OpenedPart({**digests, "options": options}, lambda: dataset)

@@ -216,7 +216,7 @@ class NuScenesSource(DatasetSource):
     @contextmanager
     def parts(self) -> Iterator[Parts]:
         with self.open() as dataset:
-            parts = (HeldScene(dataset.scene(name), dataset.meta) for name in dataset.scenes)
+            parts = (HeldScene(dataset.scene(name), dataset.meta).part for name in dataset.scenes)
             yield Parts(dataset.scenes, parts, dataset)
 
     def surroundings(self, scenes: Mapping[str, Scene]) -> Surroundings:

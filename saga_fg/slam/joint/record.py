@@ -25,8 +25,6 @@ nearer, are seen to creep. So q_0 is one half, and the other half is divided as 
 maximum likelihood of all detections by expectation maximisation, with a Dirichlet prior worth a few detections.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
