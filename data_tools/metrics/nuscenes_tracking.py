@@ -26,8 +26,7 @@ from data_tools.metrics.nuscenes_sweep import (
     track_coverage,
 )
 from data_tools.metrics.scene_boxes import SceneBoxes
-from saga_fg.errors import InputError
-from saga_fg.numerics import FloatArray, checked
+from saga_fg.numerics import FloatArray
 from saga_fg.settings import setting, settings_group
 from saga_fg.types import Boxes, Scene
 
@@ -74,20 +73,6 @@ class NuScenesTrackingScene:
     truth: SceneBoxes
     found: SceneBoxes
     racks: Sequence[Boxes] = ()
-
-    def __post_init__(self) -> None:
-        timestamps = checked("timestamps", self.timestamps, (None,))
-        frames = len(timestamps)
-        object.__setattr__(self, "timestamps", timestamps)
-        object.__setattr__(self, "ego_position", checked("ego_position", self.ego_position, (frames, 2)))
-        if (np.diff(timestamps) <= 0).any():
-            raise InputError("timestamps: expected increasing times")
-        if len(self.racks) not in (0, frames):
-            raise InputError(f"racks: expected one entry per frame ({frames}) or none, got {len(self.racks)}")
-        for name in ("truth", "found"):
-            last = int(getattr(self, name).frame.max(initial=-1))
-            if last >= frames:
-                raise InputError(f"{name}: expected frames below {frames}, got {last}")
 
 
 @dataclass(frozen=True, eq=False)

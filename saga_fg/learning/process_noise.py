@@ -30,7 +30,7 @@ from scipy.optimize import minimize, minimize_scalar
 
 from saga_fg.errors import InputError
 from saga_fg.model import ConstantVelocity, Curvilinear, KnownCourses, Motion, NodeType, own_motion
-from saga_fg.numerics import FloatArray, IntArray, checked
+from saga_fg.numerics import FloatArray, IntArray
 from saga_fg.tracking import MOVING, TurnRate
 from saga_fg.types import DEFAULT
 
@@ -53,14 +53,9 @@ class MeasuredTrajectory:
     yaw_noise: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        time = checked("time", self.time, (None,))
-        if (np.diff(time) < 0).any():
-            raise InputError(f"time[{int(np.argmax(np.diff(time) < 0)) + 1}]: expected times that do not decrease")
-        position, R = checked("position", self.position, (len(time), 2)), checked("R", self.R, (len(time), 2, 2))
-        vars(self).update(time=time, position=position, R=R)
         for name in ("yaw", "yaw_noise"):
-            given = getattr(self, name)
-            vars(self)[name] = np.full(len(time), np.nan) if given is None else np.asarray(given, dtype=np.float64)
+            if getattr(self, name) is None:
+                vars(self)[name] = np.full(len(self.time), np.nan)
 
     def __len__(self) -> int:
         return len(self.time)

@@ -11,11 +11,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, Self
 
 import numpy as np
 
-from saga_fg.errors import InputError
 from saga_fg.model import EdgeRule, NodeTable, NodeType, SceneGraph, build_graph
 from saga_fg.numerics import BoolArray, Columns, FloatArray, IntArray, StrArray
 from saga_fg.tables import PROBABILITIES
@@ -174,8 +173,6 @@ class Labels:
     source    (N,) observed, filled, extended, corrected or near
     quality   (N,) high, medium or low
     probability  that the labels are right
-
-    Raises `InputError` for columns of another length or other words.
     """
 
     tracks: Tracks
@@ -183,17 +180,6 @@ class Labels:
     source: StrArray
     quality: StrArray
     probability: Probabilities
-
-    def __post_init__(self) -> None:
-        for name, words in (("source", get_args(Source)), ("quality", get_args(Quality))):
-            column = np.asarray(getattr(self, name), dtype=np.str_)
-            if column.shape != (len(self.tracks),) or not np.isin(column, words).all():
-                raise InputError(f"{name}: expected {len(self.tracks)} of {', '.join(words)}")
-            object.__setattr__(self, name, column)
-        if np.shape(self.yaw_variance) != (len(self.tracks),):
-            raise InputError(f"yaw_variance: expected {len(self.tracks)} numbers")
-        if len(self.probability) != len(self.tracks):
-            raise InputError(f"probability: expected {len(self.tracks)} rows")
 
     @classmethod
     def empty(cls) -> Self:

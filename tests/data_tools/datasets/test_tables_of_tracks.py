@@ -183,13 +183,10 @@ def test_parquet_holds_the_same_columns(tmp_path):
     assert table.column("yaw_variance").to_pylist() == [None] * 5
 
 
-def test_labels_of_another_length_or_other_words_are_refused(tmp_path):
+def test_labels_of_another_length_are_refused(tmp_path):
     with pytest.raises(InputError, match="expected tracks for 2 moments, got 3"):
         write_label_table(tmp_path / "labels.csv", [(scene_of([0.0, 0.5]), LABELS)])
     assert not (tmp_path / "labels.csv").exists()
-    tracks = LABELS[0].tracks
-    with pytest.raises(InputError, match="source: expected 2 of observed, filled, extended"):
-        Labels(tracks, np.zeros(2), np.array(["seen", "seen"]), np.array(["low", "low"]), doubt(2))
 
 
 def test_nuscenes_tables_of_labels_are_read_as_a_dataset(tmp_path):

@@ -120,12 +120,6 @@ def test_bad_tables_and_scenes(subtests):
     ]:
         with subtests.test(rows=rows, text=text), pytest.raises(InputError, match=text):
             table(rows)
-    with pytest.raises(InputError, match="found: expected frames below 2, got 3"):
-        scene([], [(3, "t", "car", 0.0, 0.0, 0.9)], frames=2)
-    with pytest.raises(InputError, match="racks"):
-        scene([], [], frames=2, racks=[Boxes.empty()])
-    with pytest.raises(InputError, match="increasing"):
-        NuScenesTrackingScene(np.zeros(2), np.zeros((2, 2)), table([]), table([]))
 
 
 def plain_match(truth, found, threshold):
