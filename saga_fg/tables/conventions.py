@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Literal, Self
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 
@@ -31,7 +31,6 @@ MAX_FRAMES = 200
 MIN_STEP = 1e-6  # s between two frames, of which a velocity can be told
 SPAN = 0.5  # s of motion, so that the noise of places hardly matters
 _MOVES, _WALKS = 2.0, 0.8  # m/s, from which the direction of motion tells the heading, of vehicles and of people
-_NEARLY = "nearly "  # before a unit that explains headings better, which are not far off as they are
 _NEARLY_STILL = 0.8  # m/s between motions that may be the same
 _ASTRAY, _OFF = 0.5, 0.2  # rad between them: of one object, and of half of them
 _AWAY = 100.0  # m from the origin, from which what surrounds the vehicle does not surround the origin
@@ -215,14 +214,26 @@ _CONVENTIONS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
 """By unit of angles: what they look like, and the heading that is meant by what was read as rad."""
 
 
+class HeadingFit(NamedTuple):
+    """How headings fit motion.
+
+    unit  that of `_CONVENTIONS` by which they do; "rad": as they are read; "world": less the heading of the frame that
+          they are given in; "": by none
+    said  how far they are off as they are read
+    sure  False where the unit fits a little better alone, and they are not far off as they are read
+    """
+
+    unit: str
+    said: str
+    sure: bool = True
+
+
 def fitting_convention(
     yaw: FloatArray, velocity: FloatArray, walks: BoolArray, axes: FloatArray | None = None
-) -> tuple[str, str] | None:
-    """The unit of headings (n,), read as rad, of objects that move with `velocity` (n, 2), and how far they are off.
+) -> HeadingFit | None:
+    """How headings (n,), read as rad, fit objects that move with `velocity` (n, 2); None where too few move.
 
-    The unit is "rad" where they fit as they are read, "world" where they fit less the heading `axes` (n,) of the frame
-    that they are given in, "" where no convention fits, and begins with `_NEARLY` where another one fits a little
-    better; None where nothing is told, as where too few move.
+    axes  (n,) heading of the frame that they are given in, rad
     """
     moves = (np.hypot(*velocity.T) > np.where(walks, _WALKS, _MOVES)) & np.isfinite(yaw)
     if moves.sum() < 2 * FEWEST:
@@ -243,13 +254,13 @@ def fitting_convention(
     better = (now >= 0.15 and astray <= now / 3) or (usual > _OFF and off < usual / 3)
     better &= now > 0.5 or turned > 0.1  # some that are turned round are no convention
     if better and astray < 0.2 and off < _OFF:
-        return best, said
+        return HeadingFit(best, said)
     constant = np.ptp(given) < 1e-6
     if best in _CONVENTIONS and not constant and usual > max(2 * off, 0.08):  # as of mirrored ones nearly along an axis
-        return f"{_NEARLY}{best}", said
+        return HeadingFit(best, said, sure=False)
     if now > 0.5 and (constant or not walks[moves].any()):
-        return "", said
-    return ("rad", said) if now < 0.15 and usual < _OFF else None
+        return HeadingFit("", said)
+    return HeadingFit("rad", said) if now < 0.15 and usual < _OFF else None
 
 
 def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | None:
@@ -261,29 +272,31 @@ def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | Non
     of_objects = fitting_convention(sample.yaw, motion, sample.walks, axes)
     none = np.zeros(len(sample.time), dtype=np.bool_)
     of_ego = fitting_convention(sample.ego_yaw, sample.ego_motion, none)
-    units = {name: found[0] for name, found in (("yaw", of_objects), ("ego_yaw", of_ego)) if found is not None}
-    wrong = {name: unit for name, unit in units.items() if unit in _CONVENTIONS}
+    fits = {name: fit for name, fit in (("yaw", of_objects), ("ego_yaw", of_ego)) if fit is not None}
+    wrong = {name: fit.unit for name, fit in fits.items() if fit.sure and fit.unit in _CONVENTIONS}
     if "ego_yaw" in wrong and (sample.coordinates == "ego").any():
         wrong.pop("yaw", None)  # how objects move is not known before
     alike = len(wrong) == 2 and len(set(wrong.values())) == 1
     if alike or (wrong and np.isnan(sample.ego_yaw).all()):
         wrong = {"angle": wrong["yaw"]}
-    said = next(iter(found[1] for found in (of_objects, of_ego) if found is not None and found[0] != "rad"), "")
+    said = next((fit.said for fit in fits.values() if fit.unit != "rad"), "")
     if wrong:
         looks = " and ".join(dict.fromkeys(_CONVENTIONS[unit][0] for unit in wrong.values()))
         whose = "headings of the vehicle look" if wrong.keys() == {"ego_yaw"} else "headings look"
         return Finding(
             "headings", f"{whose} {looks}: {said}", "expected counter-clockwise from x, rad", Mend(units=wrong)
         )
-    if (unit := units.get("yaw", "rad")).startswith(_NEARLY):
-        what = f"headings may be {_CONVENTIONS[unit.removeprefix(_NEARLY)][0]}, or all turned: {said}"
+    if of_objects is None:
+        return headings_in_degrees(sample.yaw)
+    if not of_objects.sure:
+        what = f"headings may be {_CONVENTIONS[of_objects.unit][0]}, or all turned: {said}"
         return Finding("headings", what, "expected counter-clockwise from x, rad")
-    if units.get("yaw") in ("world", ""):
+    if of_objects.unit in ("world", ""):
         look = "look like those in the world, beside positions of the vehicle's frame"
-        what = f"headings {look if units['yaw'] else 'fit no convention'}: {said}"
-        expected = f"expected {'yaw - ego_yaw' if units['yaw'] else 'the direction of travel'}, or no headings"
+        what = f"headings {look if of_objects.unit else 'fit no convention'}: {said}"
+        expected = f"expected {'yaw - ego_yaw' if of_objects.unit else 'the direction of travel'}, or no headings"
         return Finding("headings", what, expected, Mend(columns={"yaw": ""}))
-    return headings_in_degrees(sample.yaw) if of_objects is None else None
+    return None
 
 
 _STILL = 0.5  # m/s between frames, below which an object may stand
