@@ -2,7 +2,7 @@
 
 as given    tracks of the method, whose table says which boxes are predictions
 refined     `saga-fg smooth --tracks`; shuffled: after the identities of every frame were exchanged at random, so that
-            the boxes alone are left
+            the boxes alone are left; true identities: after they were replaced by those of the true objects
 together    both methods' tracks refined to one result
 detections  labels from the detections that all of them had, by `saga-fg smooth`; tracked: by `saga-fg track`
 headings    of these labels: the share that is turned round, of boxes that match a true object, all and handed out
@@ -370,6 +370,7 @@ def set_rows(recordings: RecordingSet, seed: int) -> Iterable[Row]:
         runs.setdefault("detections, labels", {})[name] = as_run(scene, [moment.tracks for moment in moments])
         wanted = {f"{method}, refined": [result] for method, result in given.items()}
         wanted |= {f"{method}, shuffled": [shuffled(result, rng)] for method, result in given.items()}
+        wanted |= {f"{method}, true identities": [truly_named(result)] for method, result in given.items()}
         for variant, results in (wanted | {"together, refined": list(given.values())}).items():
             settings = for_given_tracks(offline, [{name: result} for result in results])
             named = dict(zip(sensor_names(len(results)), results, strict=True))
@@ -417,3 +418,12 @@ def shuffled(result: SceneResult, rng: np.random.Generator) -> SceneResult:
     found = result.found
     order = np.lexsort((rng.random(len(found)), found.frame))
     return replace(result, found=replace(found, id=found.id[order]))
+
+
+def truly_named(result: SceneResult) -> SceneResult:
+    """The result with the identities of the true objects that its boxes match: the most that identities can do."""
+    found, truth = result.found, SceneBoxes.of_annotations(result.scene.ground_truth or ())
+    row, column, _ = nearest_pairs((truth.frame, truth.boxes), (found.frame, found.boxes), GATE)
+    name = np.char.add("of the tracker ", found.id).astype("U64")
+    name[column] = truth.id[row]
+    return replace(result, found=replace(found, id=name))
