@@ -7,7 +7,7 @@ object all along, and that its heading is not turned round. A fifth one, that th
     P = 1 / (1 + exp(-(b_0 + b . features)))
 
 fitted to recordings with ground truth (four scenes of nuScenes, five of KITTI; `python -m benchmarks labels` has their
-reliability on others), but that of one object all along, the product over its steps from a detection to the next. What
+reliability), but that of one object all along, the product over its steps from a detection to the next. What
 is bad with those detectors need not be so with others: what an object's own detections settle is not far off.
 
 A look mends everything that is wrong with an object. Of n boxes handed out, where P(exists) is `HANDED_OUT` at least,
