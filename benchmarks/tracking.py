@@ -21,6 +21,7 @@ from pipelines.cli.options import Config
 from pipelines.config import load_config
 from pipelines.learning.interactions import Contender
 from pipelines.tracking import TrackedScene, track_scene
+from saga_fg.kernels.compilation import load_kernels
 
 KF, BASELINE = "kf", "centerpoint"
 ERRORS = ("position", "velocity", "heading")
@@ -49,6 +50,7 @@ def tracking(
       python -m benchmarks tracking --data data --sets kitti --no-components
       python -m benchmarks tracking --data data --sets megvii --contenders 'saga,kf,graph matching'
     """
+    load_kernels()
     wanted = compared or ",".join(variant.name for variant in (*SHIPPED, *(COMPONENTS if components else ())))
     for recordings in chosen_sets(recorded.sets, data, recorded.scenes, recorded.test, recorded.viewpoint):
         base = load_config(recordings.family, config)

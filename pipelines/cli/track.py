@@ -34,7 +34,7 @@ from pipelines.scale_out import RunSummary, SceneTask, SmoothTask, TrackTask, fi
 from pipelines.tracking import TrackedScene, keep_predictions, track_dataset
 from saga_fg import InputError
 from saga_fg.smoothing import Correction, LabelCounts, unfit
-from saga_fg.tracking import SensorTime
+from saga_fg.tracking import NO_TRACKS, SensorTime
 
 FAILED_SCENES = 1  # exit code
 
@@ -87,6 +87,7 @@ class Summary:
     scenes: int = 0
     frames: int = 0
     boxes: int = 0
+    detections: int = 0
     best_score: dict[tuple[str, int], float] = field(default_factory=dict)  # of each track, by scene and id
     milliseconds: dict[str, tuple[float, ...]] = field(default_factory=dict)
     classes: set[str] = field(default_factory=set)
@@ -104,6 +105,7 @@ class Summary:
             for name, scale in run.noise.items():
                 self.noise.setdefault(name, []).append(scale)
             self.boxes += sum(len(tracks) for tracks in run.tracks)
+            self.detections += sum(len(frame.detections) for frame in run.scene.frames)
             for tracks in run.tracks:
                 self.classes.update(tracks.boxes.label.tolist())
                 for id_, score in zip(tracks.id.tolist(), tracks.score.tolist(), strict=True):
@@ -127,6 +129,8 @@ class Summary:
         tracks = f"{counted(len(self.best_score), 'track')} ({sure} with a score above 0.5)"
         counts = (counted(self.scenes, "scene"), counted(self.frames, "frame"), tracks, counted(self.boxes, "box"))
         typer.echo(f"{self.output}: {', '.join(counts)}{rate}")
+        if self.detections and not self.boxes:
+            typer.echo(NO_TRACKS.format(self.detections, "--like dense, for own tables,"), err=True)
         for name, scales in self.noise.items():
             typer.echo(
                 f"noise of {name}: {np.median(scales):.2g} of what its model says, by its successive detections; "

@@ -4,6 +4,7 @@ Corrections are taken in the order given, each about an object as smoothed so fa
 the others bring about, such as a box that moved an object to where a later correction says it is.
 """
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,6 +24,8 @@ from saga_fg.tracking import TrackerSettings
 from saga_fg.types import Boxes
 
 PERSON = Sensor(field_of_view=FieldOfView(max_range=1e-9))  # who looks at one object misses no other
+log = logging.getLogger(__name__)
+
 REACH = 2.0  # between a place and the object that it names, m
 LATE = 0.5  # between a correction and the moment that it is moved to, s
 SPEED_DOUBT = 0.3  # of the way of an object in that time, as a standard deviation
@@ -67,6 +70,12 @@ def correct_objects(
     return result
 
 
+def _apart_from(box: Correction, time: float, standing: Correction) -> bool:
+    """Whether a box at a time, s, is not where the object is said to stand then."""
+    away = np.hypot(box.box["x"] - standing.at.x, box.box["y"] - standing.at.y)
+    return bool(standing.at.time <= time <= standing.until and away > REACH)
+
+
 class _Edits:
     """Assignments of the detections without corrections, changed by these; and the boxes of a person."""
 
@@ -74,7 +83,7 @@ class _Edits:
         self._evidence, self._objects = evidence, objects
         self._object_of, self._track_of = objects.object_of.copy(), objects.track_of.copy()
         self._boxes: dict[tuple[int, int], tuple[int, Correction]] = {}  # by object and moment: number, and the box
-        self._standing: list[tuple[int, Correction]] = []
+        self._standing: dict[int, tuple[int, Correction]] = {}  # by number: the object, and what stands
         self._said: dict[tuple[object, ...], tuple[int, object]] = {}
         self._moved: list[tuple[int, float, int]] = []  # objects that from a time on, s, are others
         self.changed: set[int] = set()
@@ -103,18 +112,52 @@ class _Edits:
                 self._join(id_, other)
             elif not one.value and other == id_:
                 self._cut(id_, number, one, now)
+        elif problem := self._moving_or_moved(id_, moment, number, one):
+            self.outcome[number] = problem
+            return True
         elif one.what == "standing":
-            self._standing.append((id_, one))
+            self._standing[number] = id_, one
             self.changed.add(id_)
         else:
             if one.what == "box":
                 self._say(("box", id_, moment), number, one)
                 self._boxes[id_, moment] = number, one
                 self.changed.add(id_)
+            if one.label and one.label not in self._evidence.boxes.label:
+                log.warning("%s: class %s: taken over, no detection has it", one.origin, one.label)
             self._say(("exists" if one.what == "box" else one.what, id_), number, one)
             self._tell(id_, one.whole)
         self.outcome.setdefault(number, "")
         return True
+
+    def _moving_or_moved(self, id_: int, moment: int, number: int, one: Correction) -> str:
+        """Why one that stands, or a box of one that does, is not taken: of two in contradiction the later is."""
+        evidence, place = self._evidence, np.array([one.at.x, one.at.y])
+        if one.what == "standing":
+            mine, times = self._object_of == id_, evidence.times[evidence.moment]
+            mine &= (times >= one.at.time) & (times <= one.until)
+            away = np.hypot(*(evidence.boxes.position[mine, :2] + evidence.origin - place).T)
+            if len(away) and (apart := float(np.median(away))) > REACH:
+                return f"half of its detections are {apart:.1f} m and more from there: it does not stand"
+            boxes = [
+                (key, given)
+                for key, (given, box) in self._boxes.items()
+                if key[0] == id_ and _apart_from(box, evidence.times[key[1]], one)
+            ]
+            if later := [self._boxes[key][1].origin for key, given in boxes if given > number]:
+                return f"contradicted by {later[0]}, which comes later and counts"
+            for key, given in boxes:
+                del self._boxes[key]
+                self.outcome[given] = f"contradicted by {one.origin}, which comes later and counts"
+        elif one.what == "box":
+            time = evidence.times[moment]
+            for given, (other, said) in list(self._standing.items()):
+                if other == id_ and _apart_from(one, time, said):
+                    if given > number:
+                        return f"contradicted by {said.origin}, which comes later and counts"
+                    del self._standing[given]
+                    self.outcome[given] = f"contradicted by {one.origin}, which comes later and counts"
+        return ""
 
     def why_not(self, one: Correction) -> str:
         """Why a correction was not taken."""
@@ -197,7 +240,7 @@ class _Edits:
         """Make two objects one, which keeps the name of the first."""
         self._object_of[self._object_of == b] = a
         self._boxes = {(a if id_ == b else id_, k): box for (id_, k), box in self._boxes.items()}
-        self._standing = [(a if id_ == b else id_, one) for id_, one in self._standing]
+        self._standing = {k: (a if id_ == b else id_, one) for k, (id_, one) in self._standing.items()}
         self._tell(a, self.whole.pop(b, WholeObject()))
         self._moved.append((b, -np.inf, a))
         self.changed |= {a, b}
@@ -292,7 +335,7 @@ class _Edits:
         """The states in which objects are said to stand."""
         time = evidence.times[states.moment]
         there = np.zeros(len(states), dtype=np.bool_)
-        for id_, one in self._standing:
+        for id_, one in self._standing.values():
             there |= (states.id == id_) & (time >= one.at.time - 1e-3) & (time <= one.until + 1e-3)
         return StationaryStates(self._objects.stationary.position_drift, states.moment[there], states.id[there])
 

@@ -250,8 +250,10 @@ class LabelBuilder:
     @property
     def outcomes(self) -> tuple[tuple[Correction, str], ...]:
         """The corrections, and why they do not hold; "" where they do."""
-        given = enumerate(self._model.corrections)
-        return tuple((one, self._outcome.get(k, "outside the recording")) for k, one in given)
+        given, end = enumerate(self._model.corrections), self._sums.last
+        late = f"stands beyond the end of the recording at {end:g} s"
+        found = ((one, self._outcome.get(k, "outside the recording")) for k, one in given)
+        return tuple((one, why or (late if one.until > end + LATE else "")) for one, why in found)
 
     def _track(self, until: float, progress: Callable[[int], None] | None) -> None:
         """The online pass over what was measured before a time."""

@@ -187,7 +187,7 @@ _ALIASES = {
     "detection_name tracking_name category_name class_id class_label",
     "sensor": "sensor_name sensor_id",
     "scene": "scene_name scene_id scene_token log_id log_name recording recording_id scenario scenario_id segment_id "
-    "drive_id",
+    "drive_id sequence sequence_id sequence_name",
     **{f"ego_{axis}": _EGO.replace("#", axis) for axis in "xyz"},
     "ego_yaw": "ego_heading ego_theta ego_vehicle_yaw ego_vehicle_heading",
     **{f"q{axis}": _QUATERNION.replace("#", axis) for axis in "wxyz"},

@@ -136,7 +136,8 @@ def _check_order(raw: RawTable, scene: StrArray, timestamp: FloatArray) -> None:
     order = np.argsort(scene, kind="stable")
     late = (np.diff(timestamp[order]) < 0) & (scene[order][1:] == scene[order][:-1])
     expected = f"{raw.title('timestamp')}: expected rows in order of time, time runs backwards at"
-    refuse(late, lambda k: raw.fault(int(order[k + 1]), f"{expected} {timestamp[order[k + 1]]} s; --sort sorts them"))
+    mend = "--sort sorts them, --columns scene=NAME tells recordings apart"
+    refuse(late, lambda k: raw.fault(int(order[k + 1]), f"{expected} {timestamp[order[k + 1]]} s; {mend}"))
 
 
 def box_columns(raw: RawTable, empty: BoolArray) -> Detections:

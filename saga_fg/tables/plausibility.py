@@ -224,4 +224,5 @@ def seems_dense_traffic(frames: Sequence[Frame]) -> str:
         return ""
     if np.concatenate(vehicles).mean() <= 0.5 or np.concatenate(headed).mean() < 0.9:
         return ""
-    return f"{count:.0f} vehicles at a time with headings, {1 / step:.3g} Hz, from a sensor that stands or hovers"
+    seen = "from a sensor that stands or hovers" if len(poses) else "and no pose of a vehicle that moves"
+    return f"{count:.0f} vehicles at a time with headings, {1 / step:.3g} Hz, {seen}"

@@ -21,7 +21,16 @@ from .settings import (
     TrackerSettings,
     TypicalSize,
 )
-from .table_tracking import IdentityTracker, Like, dense_traffic_settings, plain_settings, predict, read_scenes, track
+from .table_tracking import (
+    NO_TRACKS,
+    IdentityTracker,
+    Like,
+    dense_traffic_settings,
+    plain_settings,
+    predict,
+    read_scenes,
+    track,
+)
 from .track_filters import MOVING, Kinematics, TurnRate
 from .track_table import SensorEvidence, TrackTable
 from .tracker import Tracker
@@ -31,6 +40,7 @@ from .update import visible_share
 
 __all__ = [
     "MOVING",
+    "NO_TRACKS",
     "AssociationCost",
     "AssociationName",
     "AssociationProblem",

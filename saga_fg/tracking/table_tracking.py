@@ -121,6 +121,9 @@ UNKNOWN_SENSORS: Mapping[str, Sensor] = {DEFAULT: Sensor(calibrate_noise=True, c
 """Models of sensors of which nothing is known: their detections tell how noisy they are, and their scores how many of a
 frame are false."""
 
+NO_TRACKS = "{} detections, no track: none is probable, or comes where one is expected; {} expects more between frames"
+"""What is said of detections without tracks; to be filled in: their number, and how to choose other settings."""
+
 UNNAMED = "object"
 """Class of detections without a column of classes; any name will do."""
 
@@ -152,10 +155,15 @@ def track(
     """
     _tell_default(settings)
     found = read_scenes(detections, how, settings, sensors, method)
-    parts = []
+    parts, boxes, detections_seen = [], 0, 0
     for scene in found.scenes:
         tracker = found.new_tracker()
-        parts += [found.named(scene.name, tracker.step(frame).table_columns()) for frame in scene.frames]
+        for frame in scene.frames:
+            tracks = tracker.step(frame)
+            parts.append(found.named(scene.name, tracks.table_columns()))
+            boxes, detections_seen = boxes + len(tracks), detections_seen + len(frame.detections)
+    if detections_seen and not boxes:
+        warnings.warn(NO_TRACKS.format(detections_seen, "settings='dense'"), stacklevel=2)
     return table_like(detections, parts or [found.named("", Tracks.empty(0.0).table_columns())])
 
 

@@ -102,11 +102,11 @@ def test_it_runs_in_parallel_and_again_only_what_has_changed(square, tmp_path):
 
 
 def test_one_without_recordings_says_what_it_lacks(packages):
-    (packages / "nowhere.py").write_text(
-        "from data_tools.datasets.source import DatasetSource as D\n\n\nclass Nowhere(D):\n    name = 'nowhere'\n"
+    (packages / "bare.py").write_text(
+        "from data_tools.datasets.source import DatasetSource as D\n\n\nclass Bare(D):\n    name = 'bare'\n"
     )
-    said = refused("track", "nowhere:Nowhere", "-o", "x.csv")
-    assert "dataset: Nowhere: expected scenes and scene(name), or open" in said
+    said = refused("track", "bare:Bare", "-o", "x.csv")
+    assert "dataset: Bare: expected scenes and scene(name), or open" in said
 
 
 def test_by_module_and_class_it_need_not_be_installed(square, tmp_path):

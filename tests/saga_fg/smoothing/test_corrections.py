@@ -157,6 +157,25 @@ def test_an_object_said_to_stand_stands(builder):
     assert sources == {"corrected"}
 
 
+def test_of_a_standing_object_what_contradicts_it_is_named(builder, caplog):
+    """Detections that move on, a box elsewhere in that time, before it or after, and an end beyond the recording."""
+    stands = {"what": "standing", "at": {"time": 6.0, "x": 24.0, "y": 30.4}, "until": 8.0}
+    box = {"what": "box", "at": {"time": 7.0, "x": 24.0, "y": 30.4}, "box": {"x": 24.0, "y": 33.0}}
+    found, problems = corrected(builder, stands, box)
+    assert problems == ["contradicted by corrections: 2, which comes later and counts"]
+    assert boxes_of(found, 4)[7.0][1] > 32.0
+    found, problems = corrected(builder, box, stands)
+    assert problems == ["contradicted by corrections: 2, which comes later and counts"]
+    assert abs(boxes_of(found, 4)[7.0][1] - 30.4) < 1.0
+    (problem,) = corrected(builder, {"what": "standing", "at": CAR, "until": 9.0})[1]
+    assert "and more from there: it does not stand" in problem
+    (problem,) = corrected(builder, stands | {"until": 900.0, "at": {"time": 9.75, "x": 30.0, "y": 30.0}})[1]
+    assert problem.startswith("stands beyond the end of the recording at ")
+    _, problems = corrected(builder, {"what": "class", "at": CAR, "label": "caar"})
+    assert problems == []
+    assert "class caar: taken over, no detection has it" in caplog.text
+
+
 def test_what_does_not_fit_is_named(builder):
     far, late = {"time": 5.0, "x": 500.0, "y": 0.0}, {"time": 500.0, "x": 40.0, "y": 0.0}
     _, problems = corrected(

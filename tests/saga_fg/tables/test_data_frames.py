@@ -172,7 +172,7 @@ def test_a_value_is_named_by_its_column_and_row(subtests):
 
 def test_what_is_probably_wrong_is_warned_of(subtests):
     for columns, message in [
-        ({"label": "car", "score": -2.5}, r'Sensor\(score="logit"\)'),
+        ({"label": "car", "score": [-2.5, 3.0] * 12}, r'Sensor\(score="logit"\)'),
         (
             {"label": "REGULAR_VEHICLE"},
             r"no edges: tracker.edges act on .*car.*, and the tracks are of REGULAR_VEHICLE; .*; "
@@ -198,8 +198,9 @@ def test_a_table_that_contradicts_how_it_is_read_is_refused_with_what_mends_it(s
             mended = f"; add how=TableImport({wanted}); {given} reads it as it is"
             with pytest.raises(InputError, match=re.escape(mended)):
                 saga_fg.track(rows)
-            with pytest.warns(UserWarning, match=re.escape(wanted)):
+            with pytest.warns(UserWarning) as told:
                 saga_fg.track(rows, how=TableImport(as_given=True))
+            assert any(wanted in str(each.message) for each in told)
             if "length" not in str(mend):
                 with warnings.catch_warnings():
                     warnings.simplefilter("error")

@@ -1,6 +1,7 @@
 """Dense road traffic: a recording of it is recognised, and others are not."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from saga_fg import TrackerSettings, track
@@ -62,3 +63,12 @@ def test_a_table_of_it_is_tracked_with_its_settings():
     assert found.equals(by_name)
     with pytest.warns(UserWarning, match="dense_traffic_settings.. of saga_fg.tracking fit better than those given"):
         assert not found.equals(track(table, TrackerSettings(min_hits=2)))
+
+
+def test_detections_without_tracks_are_told():
+    """Three cars abreast, once a second: others may have come where each is expected."""
+    rows = [(float(k), "car", 5.0 * k, y) for k in range(20) for y in (0.0, 9.0, 18.0)]
+    table = pd.DataFrame(rows, columns=["timestamp", "label", "x", "y"])
+    with pytest.warns(UserWarning, match=r"60 detections, no track: .*; settings='dense' expects more between frames"):
+        assert len(track(table)) == 0
+    assert track(table, "dense").id.nunique() == 3
