@@ -198,7 +198,8 @@ def test_a_table_that_contradicts_how_it_is_read_is_refused_with_what_mends_it(s
             mended = f"; add how=TableImport({wanted}); {given} reads it as it is"
             with pytest.raises(InputError, match=re.escape(mended)):
                 saga_fg.track(rows)
-            with pytest.warns(UserWarning) as told:
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("always")
                 saga_fg.track(rows, how=TableImport(as_given=True))
             assert any(wanted in str(each.message) for each in told)
             if "length" not in str(mend):

@@ -59,6 +59,7 @@ def test_marginals_of_500_random_problems_against_all_joint_events():
         expected = enumerated(i, j, w)
         np.testing.assert_allclose(association_marginals(i, j, w, LARGEST_EXACT, SWEEPS), expected, atol=1e-6)
         apart.append(np.abs(association_marginals(i, j, w, 0, SWEEPS) - expected).max(initial=0.0))
+    print("loopy, up to 5 x 5, largest difference, median and 95 %:", *np.quantile(apart, [0.5, 0.95]))
     assert np.median(apart) <= 0.03
 
 
@@ -69,6 +70,7 @@ def test_marginals_of_large_clusters_by_belief_propagation():
         exact, loopy = (association_marginals(i, j, w, largest, SWEEPS) for largest in (11, LARGEST_EXACT))
         apart.append(np.abs(exact - loopy).max())
         assert (np.bincount(i, loopy) <= 1 + 1e-9).all()
+    print("loopy, 9 x 9 to 11 x 11, largest difference, median and 95 %:", *np.quantile(apart, [0.5, 0.95]))
     assert 0 < np.median(apart) <= 0.03
 
 
