@@ -8,7 +8,6 @@ only where another convention explains the data much better.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import Literal, NamedTuple, Self
 
 import numpy as np
@@ -25,13 +24,20 @@ from saga_fg.tables.plausibility import (
     usual_class,
     within_a_metre,
 )
+from saga_fg.tables.velocities import (
+    ALIKE,
+    MAX_FRAMES,
+    MIN_STEP,
+    MOVES,
+    SPAN,
+    WALKS,
+    rotated,
+    shared_motion,
+    velocities_against_motion,
+    velocities_between_frames,
+)
 from saga_fg.types import Boxes, Finding, Frame, Mend
 
-MAX_FRAMES = 200
-MIN_STEP = 1e-6  # s between two frames, of which a velocity can be told
-SPAN = 0.5  # s of motion, so that the noise of places hardly matters
-_MOVES, _WALKS = 2.0, 0.8  # m/s, from which the direction of motion tells the heading, of vehicles and of people
-_NEARLY_STILL = 0.8  # m/s between motions that may be the same
 _ASTRAY, _OFF = 0.5, 0.2  # rad between them: of one object, and of half of them
 _AWAY = 100.0  # m from the origin, from which what surrounds the vehicle does not surround the origin
 _DEEP, _FLAT, _NEAR = 8.0, 3.0, 40.0  # m: spread of depths, spread of heights, and the nearest depth before a camera
@@ -117,7 +123,7 @@ class Sample:
     def placed(self) -> FloatArray:
         """(N, 2) positions in the world if they are in the vehicle's frame."""
         place, yaw = self.ego
-        return place + _turned(self.boxes.position[:, :2], yaw)
+        return place + rotated(self.boxes.position[:, :2], yaw)
 
     def motion(self, position: FloatArray) -> FloatArray:
         """(N, 2) velocities between frames of positions (N, 2), NaN where they are not clear."""
@@ -129,7 +135,7 @@ class Sample:
         given = self.coordinates[self.frame]
         of_ego = (given == "ego")[:, None]
         motion = self.motion(np.where(of_ego, self.placed(), self.boxes.position[:, :2]))
-        motion = np.where(of_ego, _turned(motion, -self.ego[1]), motion)
+        motion = np.where(of_ego, rotated(motion, -self.ego[1]), motion)
         motion[given == "sensor"] = np.nan
         return motion
 
@@ -142,55 +148,6 @@ class Sample:
         place, took = self.world_T_ego[:, :2, 3], self.time[later[rows]] - self.time[rows]
         found[rows] = (place[later[rows]] - place[rows]) / took[:, None]
         return found
-
-
-def velocities_between_frames(time: FloatArray, label: StrArray, position: FloatArray) -> FloatArray:
-    """Velocities (n, 2) of detections at times (n,), s, and places (n, 2) in the world; NaN where they are not clear.
-
-    That of a detection is over half a second and more, from frame to frame to the nearest of its class, if it is the
-    nearest of that in turn, and the second nearest is twice as far.
-    """
-    from scipy.spatial import cKDTree
-
-    following = np.full(len(time), -1)
-    known = np.isfinite(time) & np.isfinite(position).all(axis=1)
-    for name in np.unique(label).tolist():
-        mine = np.flatnonzero((label == name) & known)
-        moments = np.unique(time[mine])[: MAX_FRAMES + 1]
-        frames = [mine[time[mine] == moment] for moment in moments]
-        for now, later in pairwise(frames):
-            distance, nearest = cKDTree(position[later]).query(position[now], k=2)
-            _, back = cKDTree(position[now]).query(position[later])
-            clear = (back[nearest[:, 0]] == np.arange(len(now))) & (distance[:, 1] > 2 * distance[:, 0])
-            clear &= time[later[0]] - time[now[0]] > MIN_STEP
-            following[now[clear]] = later[nearest[clear, 0]]
-    reached, found = np.arange(len(time)), np.full(position.shape, np.nan)
-    for _ in range(MAX_FRAMES):
-        short = time[reached] - time < SPAN - MIN_STEP
-        short &= following[reached] >= 0
-        if not short.any():
-            break
-        reached[short] = following[reached[short]]
-    took = time[reached] - time
-    rows = np.flatnonzero((took >= SPAN - MIN_STEP) & known)
-    found[rows] = (position[reached[rows]] - position[rows]) / took[rows, None]
-    return found
-
-
-def shared_motion(time: FloatArray, motion: FloatArray) -> FloatArray:
-    """The motion (n, 2) that most objects share in the second of each row, by motions (n, 2); NaN where unknown.
-
-    It is where frames, at times (n,), s, have three objects and more.
-    """
-    shared, known = np.full(motion.shape, np.nan), np.isfinite(motion).all(axis=1)
-    second = np.floor(time)
-    for now in np.unique(second[known]).tolist():
-        rows = np.flatnonzero(known & (second == now))[:MAX_FRAMES]
-        if len(rows) < 3 * len(np.unique(time[rows])):
-            continue
-        near = np.hypot(*(motion[rows, None] - motion[None, rows]).transpose(2, 0, 1)) < _NEARLY_STILL
-        shared[second == now] = motion[rows[near[near.sum(axis=1).argmax()]]].mean(axis=0)
-    return shared
 
 
 def headings_in_degrees(yaw: FloatArray, column: Literal["angle", "ego_yaw"] = "angle") -> Finding | None:
@@ -235,7 +192,7 @@ def fitting_convention(
 
     axes  (n,) heading of the frame that they are given in, rad
     """
-    moves = (np.hypot(*velocity.T) > np.where(walks, _WALKS, _MOVES)) & np.isfinite(yaw)
+    moves = (np.hypot(*velocity.T) > np.where(walks, WALKS, MOVES)) & np.isfinite(yaw)
     if moves.sum() < 2 * FEWEST:
         return None
     direction, given = np.arctan2(velocity[moves, 1], velocity[moves, 0]), yaw[moves]
@@ -299,92 +256,6 @@ def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | Non
     return None
 
 
-_STILL = 0.5  # m/s between frames, below which an object may stand
-_SPEEDS = {"km/h": 3.6, "ft/s": 3.281, "mph": 2.237}
-_WITHOUT = Mend(columns={"vx": "", "vy": ""})
-
-
-def velocities_against_motion(
-    velocity: FloatArray, motion: FloatArray, ego: FloatArray | None = None, axes: FloatArray | None = None
-) -> Finding | None:
-    """Measured velocities (n, 2) which are those between frames (n, 2) in another unit or sense, or are none.
-
-    ego   (n, 2) velocity of the vehicle over ground, to which they may be relative
-    axes  (n,) turn of the axes along which they may be instead, rad
-    """
-    known = np.isfinite(motion).all(axis=1) & np.isfinite(velocity).all(axis=1)
-    if known.sum() < 2 * FEWEST:
-        return None
-    velocity, motion, squares = velocity[known], motion[known], (velocity[known] ** 2).sum(axis=1)
-    clear = np.hypot(*motion.T) > _MOVES
-    if clear.sum() >= 2 * FEWEST and share(squares[clear] < 1e-18) > 0.9:
-        what = "measured velocities are zero of objects that move"
-        return Finding("speeds", what, "expected those over ground, or none", _WITHOUT)
-    moves = clear | (squares > (2 * _WALKS) ** 2)
-    if moves.sum() < 2 * FEWEST:
-        return None
-    meant = {
-        "are exchanged": (velocity[:, ::-1], Mend(columns={"vx": "vy", "vy": "vx"})),
-        "are reversed": (-velocity, _WITHOUT),
-        "are mirrored": (velocity * [1.0, -1.0], _WITHOUT),
-    }
-    if ego is not None:
-        meant["are relative to the vehicle"] = velocity + ego[known], _WITHOUT
-    if axes is not None:
-        meant["are along other axes than positions"] = _turned(velocity, axes[known]), _WITHOUT
-    apart = {name: _middle_distance(each[moves], motion[moves]) for name, (each, _) in meant.items()}
-    least = min(apart.values())
-    scaled = min(_middle_distance(velocity[moves] * k, motion[moves]) for f in _SPEEDS.values() for k in (f, 1 / f))
-    now, usual = (_middle_distance(each[moves], motion[moves]) for each in (velocity, 0 * motion))
-    if now > max(1.0, 0.3 * usual) and least < 0.35 * now and least + 0.1 < scaled:
-        name = next(name for name in meant if apart[name] < least + 0.1)
-        what = f"measured velocities vx, vy look as if they {name}: half of them differ from the motion between frames"
-        return Finding("speeds", f"{what} by {now:.2g} m/s and more", "expected those over ground", meant[name][1])
-    return _speeds_in_another_unit(velocity, motion, squares)
-
-
-def _middle_distance(a: FloatArray, b: FloatArray) -> float:
-    apart = np.hypot(*(a - b).T)
-    return float(np.median(apart[np.isfinite(apart)])) if np.isfinite(apart).mean() > 0.5 else np.inf
-
-
-def _speeds_in_another_unit(velocity: FloatArray, motion: FloatArray, squares: FloatArray) -> Finding | None:
-    """Velocities (n, 2) as large as those between frames (n, 2) in another unit than m/s, or those divided by one.
-
-    Fast objects tell the factor. Where all are slow, the mean squares of all velocities v do, less the noise of those
-    that stay where they are: f = sum(|v|^2 - noise) / sum(v m), with m between frames.
-    """
-    products, ways = (velocity * motion).sum(axis=1), (motion**2).sum(axis=1)
-    fast, clear = squares > (2 * _WALKS) ** 2, ways > _MOVES**2
-    found: list[tuple[float, list[str]]] = []
-    if fast.sum() >= 2 * FEWEST:
-        found.append((1 / max(_weighted_median(products[fast] / squares[fast], squares[fast]), 1e-3), list(_SPEEDS)))
-        still = np.sqrt(ways) < _STILL
-        if still.sum() >= FEWEST:
-            noise = np.median(squares[still]) / np.log(2)
-            found.append((max((squares - noise).sum() / max(products.sum(), 1e-3), 1e-3), ["km/h", "mph"]))
-    for factor, units in found:  # the second is too rough for more units
-        unit = min(units, key=lambda unit: abs(np.log(factor / _SPEEDS[unit])))
-        if 0.85 < factor / _SPEEDS[unit] < 1.15:
-            what = f"measured velocities are {factor:.2g} times as large as objects move from frame to frame"
-            return Finding("speeds", f"{what}: they look like {unit}", "expected m/s", Mend(units={"speed": unit}))
-    if clear.sum() < 2 * FEWEST:
-        return None
-    ratio = products[clear] / ways[clear]
-    factor = _weighted_median(ratio, ways[clear])
-    unit = min(_SPEEDS, key=lambda unit: abs(np.log(max(factor, 1e-3) * _SPEEDS[unit])))
-    if not 0.92 < factor * _SPEEDS[unit] < 1.08 or share(np.abs(ratio - factor) < 0.3 * factor) < 0.6:
-        return None
-    what = f"measured velocities vx, vy are {factor:.2g} times as large as objects move from frame to frame"
-    what += f": they look like m/s taken for {unit}, or divided twice"
-    return Finding("speeds", what, "expected m/s", Mend(units={"speed": "m/s"}))
-
-
-def _weighted_median(values: FloatArray, weight: FloatArray) -> float:
-    order = np.argsort(values)
-    return float(values[order[np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())]])
-
-
 def camera_axes(position: FloatArray) -> Finding | None:
     """Positions (n, 3) with x to the right, y down and z ahead, as cameras have them."""
     if len(position) < 2 * FEWEST:
@@ -422,14 +293,12 @@ def _fits_better(sample: Sample, rows: IntArray, read: FloatArray, other: FloatA
     turn = -sample.ego[1] if (sample.coordinates[sample.frame[rows[0]]] == "ego") else None
     motions = [sample.motion(read), sample.motion(other)]
     own = int(turn is None)  # the one of them that is of the vehicle's frame
-    motions[own] = _turned(motions[own], -sample.ego[1])
+    motions[own] = rotated(motions[own], -sample.ego[1])
     for apart_of, least in ((_heading_apart, 0.12), (_velocity_apart, 0.3)):
         apart = [apart_of(sample, motion, rows) for motion in motions]
-        velocities_decide = own == 1 or _far_from_origin(other[rows], sample.ego[0][rows])
-        if min(map(len, apart)) >= 2 * FEWEST and (apart_of is _heading_apart or velocities_decide):
-            one, another = (float(np.median(each)) for each in apart)
-            if one > least and another < 0.4 * one:
-                return True
+        decide = apart_of is _heading_apart or own == 1 or _far_from_origin(other[rows], sample.ego[0][rows])
+        if decide and _less_apart(apart, least, 0.4):
+            return True
         if len(apart[0]) >= 2 * FEWEST and np.median(apart[0]) < least:
             return apart_of is _velocity_apart and own == 1 and _slide_past(sample, rows)
     return own == 1 and _stay_nearer(sample, rows, read, other)  # traffic that goes along stays in the vehicle's frame
@@ -443,6 +312,14 @@ _TRAVELLED = 3.0  # m of the vehicle, from which it shows what moves with it
 _PAIRS = 20  # pairs of frames that are compared
 
 
+def _less_apart(apart: Sequence[FloatArray], least: float, most: float) -> bool:
+    """True if the median of the first is above `least`, and that of the second below the share `most` of it."""
+    if min(map(len, apart)) < 2 * FEWEST:
+        return False
+    one, another = (float(np.median(each)) for each in apart)
+    return one > least and another < most * one
+
+
 def _velocity_apart(sample: Sample, motion: FloatArray, rows: IntArray) -> FloatArray:
     """m/s between measured velocities and those between frames."""
     apart = np.hypot(*(sample.boxes.velocity - motion)[rows].T)
@@ -451,7 +328,7 @@ def _velocity_apart(sample: Sample, motion: FloatArray, rows: IntArray) -> Float
 
 def _heading_apart(sample: Sample, motion: FloatArray, rows: IntArray) -> FloatArray:
     """Rad between headings and motion between frames, of objects that move."""
-    least = np.where(sample.walks, _WALKS, _MOVES)
+    least = np.where(sample.walks, WALKS, MOVES)
     moves = rows[(np.hypot(*motion.T) > least)[rows] & np.isfinite(sample.yaw)[rows] & ~sample.stands[rows]]
     return np.asarray(np.abs(wrap_angle(sample.yaw[moves] - np.arctan2(motion[moves, 1], motion[moves, 0]))))
 
@@ -470,14 +347,12 @@ def _share_motion_of_vehicle(sample: Sample) -> bool:
     rows = np.flatnonzero(np.isnan(sample.ego[1]) & (sample.coordinates == "world").all())
     driven = np.where(sample.walks[:, None], np.nan, motion)
     for apart_of, moved, of, least in (
-        (_velocity_apart, motion, motion - velocity, _MOVES),
+        (_velocity_apart, motion, motion - velocity, MOVES),
         (_heading_apart, driven, driven, _ASTRAY),
     ):
         apart = [apart_of(sample, each, rows) for each in (moved, moved - shared_motion(time, of))]
-        if min(map(len, apart)) >= 2 * FEWEST:
-            one, another = (float(np.median(each)) for each in apart)
-            if one > least and another < 0.45 * one:
-                return True
+        if _less_apart(apart, least, 0.45):
+            return True
     return False
 
 
@@ -494,10 +369,10 @@ def _slide_past(sample: Sample, rows: IntArray) -> bool:
     """True if objects move as what stands does, seen from the vehicle, and hardly any stands as it is read."""
     motion = sample.motion(sample.boxes.position[:, :2])[rows]
     driven = np.hypot(*sample.ego_motion[sample.frame[rows]].T)
-    known = np.isfinite(motion).all(axis=1) & (driven > _MOVES)
+    known = np.isfinite(motion).all(axis=1) & (driven > MOVES)
     motion, driven = motion[known], driven[known]
-    slides = share(np.hypot(motion[:, 0] + driven, motion[:, 1]) < _NEARLY_STILL)
-    return len(motion) >= 2 * FEWEST and slides > 0.3 and share(np.hypot(*motion.T) < _NEARLY_STILL) < 0.05
+    slides = share(np.hypot(motion[:, 0] + driven, motion[:, 1]) < ALIKE)
+    return len(motion) >= 2 * FEWEST and slides > 0.3 and share(np.hypot(*motion.T) < ALIKE) < 0.05
 
 
 def _stay_nearer(sample: Sample, rows: IntArray, given: FloatArray, placed: FloatArray) -> bool:
@@ -519,11 +394,6 @@ def _stay_nearer(sample: Sample, rows: IntArray, given: FloatArray, placed: Floa
         return False
     stays, moves = float(np.median(np.concatenate(as_placed))), float(np.median(np.concatenate(as_given)))
     return moves > 1.0 and stays < 0.5 * moves
-
-
-def _turned(vectors: FloatArray, yaw: FloatArray) -> FloatArray:
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.column_stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]])
 
 
 def findings_of(sample: Sample, logits: Callable[[str], bool] = lambda sensor: False) -> list[Finding]:
@@ -550,11 +420,11 @@ def findings_of(sample: Sample, logits: Callable[[str], bool] = lambda sensor: F
         motion, measured = sample.own_motion, boxes.velocity
         of_ego, turn = sample.coordinates[sample.frame] == "ego", sample.ego[1]
         ego = sample.ego_motion[sample.frame]
-        ego = np.where(of_ego[:, None], _turned(ego, -turn), ego)
+        ego = np.where(of_ego[:, None], rotated(ego, -turn), ego)
         speeds = velocities_against_motion(measured, motion, ego, np.where(of_ego, -turn, turn))
         speeds = speeds or far_too_fast(label, measured)
         if speeds is None or (speeds.mend is not None and speeds.mend.units):
-            known = np.isfinite(measured).any(axis=1) & (np.hypot(*measured.T) > _WALKS)
+            known = np.isfinite(measured).any(axis=1) & (np.hypot(*measured.T) > WALKS)
             motion = np.where(known[:, None], measured, motion)
         motion = np.where(sample.stands[:, None], np.nan, motion)
         headings = headings_against_motion(sample, motion)

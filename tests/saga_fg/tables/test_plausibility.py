@@ -12,8 +12,6 @@ from saga_fg.tables.conventions import (
     fitting_convention,
     frame_taken_for_another,
     headings_in_degrees,
-    velocities_against_motion,
-    velocities_between_frames,
 )
 from saga_fg.tables.plausibility import (
     far_too_fast,
@@ -27,6 +25,7 @@ from saga_fg.tables.plausibility import (
     usual_classes,
     within_a_metre,
 )
+from saga_fg.tables.velocities import velocities_against_motion, velocities_between_frames
 from saga_fg.types.dataset import Finding, Mend
 
 RNG = np.random.default_rng(5)
