@@ -70,8 +70,12 @@ def correct_objects(
     return result
 
 
+def _superseded_by(later: Correction) -> str:
+    return f"contradicted by {later.origin}, which comes later and counts"
+
+
 def _apart_from(box: Correction, time: float, standing: Correction) -> bool:
-    """Whether a box at a time, s, is not where the object is said to stand then."""
+    """True if a box at a time, s, is more than `REACH` from where the object is said to stand then."""
     away = np.hypot(box.box["x"] - standing.at.x, box.box["y"] - standing.at.y)
     return bool(standing.at.time <= time <= standing.until and away > REACH)
 
@@ -112,7 +116,7 @@ class _Edits:
                 self._join(id_, other)
             elif not one.value and other == id_:
                 self._cut(id_, number, one, now)
-        elif problem := self._moving_or_moved(id_, moment, number, one):
+        elif problem := self._elsewhere(id_, moment, number, one):
             self.outcome[number] = problem
             return True
         elif one.what == "standing":
@@ -130,33 +134,27 @@ class _Edits:
         self.outcome.setdefault(number, "")
         return True
 
-    def _moving_or_moved(self, id_: int, moment: int, number: int, one: Correction) -> str:
-        """Why one that stands, or a box of one that does, is not taken: of two in contradiction the later is."""
-        evidence, place = self._evidence, np.array([one.at.x, one.at.y])
+    def _elsewhere(self, id_: int, moment: int, number: int, one: Correction) -> str:
+        """Why one that stands, or a box of one that does, is not taken; earlier ones that contradict it go."""
+        evidence = self._evidence
         if one.what == "standing":
             mine, times = self._object_of == id_, evidence.times[evidence.moment]
             mine &= (times >= one.at.time) & (times <= one.until)
-            away = np.hypot(*(evidence.boxes.position[mine, :2] + evidence.origin - place).T)
+            away = np.hypot(*(evidence.boxes.position[mine, :2] + evidence.origin - [one.at.x, one.at.y]).T)
             if len(away) and (apart := float(np.median(away))) > REACH:
                 return f"half of its detections are {apart:.1f} m and more from there: it does not stand"
-            boxes = [
-                (key, given)
-                for key, (given, box) in self._boxes.items()
-                if key[0] == id_ and _apart_from(box, evidence.times[key[1]], one)
-            ]
-            if later := [self._boxes[key][1].origin for key, given in boxes if given > number]:
-                return f"contradicted by {later[0]}, which comes later and counts"
-            for key, given in boxes:
-                del self._boxes[key]
-                self.outcome[given] = f"contradicted by {one.origin}, which comes later and counts"
+            boxes = [(k, given, evidence.times[at]) for (i, at), (k, given) in self._boxes.items() if i == id_]
+            others = {k: given for k, given, time in boxes if _apart_from(given, time, one)}
         elif one.what == "box":
-            time = evidence.times[moment]
-            for given, (other, said) in list(self._standing.items()):
-                if other == id_ and _apart_from(one, time, said):
-                    if given > number:
-                        return f"contradicted by {said.origin}, which comes later and counts"
-                    del self._standing[given]
-                    self.outcome[given] = f"contradicted by {one.origin}, which comes later and counts"
+            stand = [(k, given) for k, (i, given) in self._standing.items() if i == id_]
+            others = {k: given for k, given in stand if _apart_from(one, evidence.times[moment], given)}
+        else:
+            return ""
+        if max(others, default=-1) > number:
+            return _superseded_by(others[max(others)])
+        self.outcome |= dict.fromkeys(others, _superseded_by(one))
+        self._boxes = {key: each for key, each in self._boxes.items() if each[0] not in others}
+        self._standing = {k: each for k, each in self._standing.items() if k not in others}
         return ""
 
     def why_not(self, one: Correction) -> str:
@@ -172,7 +170,7 @@ class _Edits:
         said = {"exists": one.whole.exists, "class": one.label, "same": one.value}.get(str(about[0]), one.box)
         before, self._said[about] = self._said.get(about), (number, said)
         if before is not None and before[1] != said:
-            self.outcome[before[0]] = f"contradicted by {one.origin}, which comes later and counts"
+            self.outcome[before[0]] = _superseded_by(one)
 
     def _tell(self, id_: int, said: WholeObject) -> None:
         self.whole[id_] = self.whole.get(id_, WholeObject()).updated(said)

@@ -35,9 +35,14 @@ FACTORS: Mapping[Kind, Mapping[str, float]] = {
     | {"compass": -pi / 180, "compass_rad": -1.0},
     "score": {"share": 1.0, "percent": 0.01},
 }
-_BY_SIZE = {"times": "timestamp", "angle in degrees": "yaw", "ego_yaw in degrees": "ego_yaw", "lengths": "length"}
-_BY_SIZE["places"] = "x"
-"""Columns, whose units are told by the size of numbers alone, by the kind of the finding."""
+_BY_SIZE = {
+    "times": "timestamp",
+    "angle in degrees": "yaw",
+    "ego_yaw in degrees": "ego_yaw",
+    "lengths": "length",
+    "places": "x",
+}
+"""By kind of finding: a column whose unit is told by the size of its numbers alone."""
 _DEGREES = {"clockwise": "clockwise_deg", "compass_rad": "compass"}
 OFFSETS = {"compass": pi / 2, "compass_rad": pi / 2}
 """Offset of angles in these units, rad: a compass counts clockwise from the y axis, which is north."""
@@ -435,7 +440,10 @@ class TableImport(Settings):
         return option_text(entries, within)
 
     def _possible(self, mend: Mend, names: Mapping[str, str]) -> Mend | None:
-        """What mends a suspicion: without speeds that are read as m/s already; None where all of it is said here."""
+        """The mend of a finding without what these options say already; None if nothing is left.
+
+        Speeds that are read as m/s already cannot be mended by that unit: their columns are left out instead.
+        """
         by_name = _unit_at_end("vx", names.get("vx", ""))
         if mend.units.get("speed") == "m/s" and self.unit("vx", by_name) in (None, "m/s"):
             units = {name: unit for name, unit in mend.units.items() if name != "speed"}

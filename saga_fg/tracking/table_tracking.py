@@ -122,7 +122,7 @@ UNKNOWN_SENSORS: Mapping[str, Sensor] = {DEFAULT: Sensor(calibrate_noise=True, c
 frame are false."""
 
 NO_TRACKS = "{} detections, no track: none is probable, or comes where one is expected; {} expects more between frames"
-"""What is said of detections without tracks; to be filled in: their number, and how to choose other settings."""
+"""Warning of detections that give no track, to be formatted with their number and the option to try."""
 
 UNNAMED = "object"
 """Class of detections without a column of classes; any name will do."""
