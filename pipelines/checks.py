@@ -37,7 +37,7 @@ class Checks:
     settings    of the run
     usual       the shipped settings: what a file for --config adds to them should meet something in the data
     option_for  the options of the command that mend a suspicion, "" for none
-    live_plain  whether live frames that look like dense traffic are told, as --like and --config are left out
+    live_plain  whether live frames that look like dense traffic are told, as --settings and --config are left out
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class Checks:
             why = seems_dense_traffic(self._live) if self._live_plain else ""
             if why:
                 self._tell(
-                    [Finding("dense", f"dense traffic: {why}", "expected settings for it", option="--like dense")]
+                    [Finding("dense", f"dense traffic: {why}", "expected settings for it", option="--settings dense")]
                 )
             self.finish()
             self._live, self._yaw = [], []

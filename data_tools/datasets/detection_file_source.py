@@ -57,7 +57,7 @@ COORDINATES_TEXT = (
     "Coordinates of rows that say none; all but world need the pose of the vehicle. camera: at its origin, x to the "
     "right, y down, z ahead.  [default: world]"
 )
-LIKE_TEXT = "Settings to begin with: dense for road traffic seen by a sensor that stands or hovers, plain for all else"
+SETTINGS_TEXT = "Settings: dense for road traffic seen by a sensor that stands or hovers, plain for all else"
 SORT_TEXT = "Sort the rows by time, in memory."
 AS_GIVEN_TEXT = "Read the table as it is said to be, even where its contents contradict it."
 IMPORT_TEXT = "YAML file with the same: columns, classes, units, coordinates, sort, as_given."
@@ -114,8 +114,8 @@ class DetectionFileSource(DatasetSource):
     coordinates: Literal["world", "ego", "sensor", "camera"] | None = option(COORDINATES_TEXT, None)
     sort: bool = option(SORT_TEXT, False)
     as_given: bool = option(AS_GIVEN_TEXT, False)
-    like: Literal["plain", "dense"] | None = option(
-        f"{LIKE_TEXT}.  [default: what the first rows look like]",
+    settings: Literal["plain", "dense"] | None = option(
+        f"{SETTINGS_TEXT}.  [default: what the first rows look like]",
         None,
         verbs=("track", "smooth", "evaluate", "evaluate labels"),
     )

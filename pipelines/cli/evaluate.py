@@ -63,7 +63,7 @@ def _evaluate(
         found, innovations = _tracked(source, settings, tracker.method)
     else:
         given = {name: value for name, value in vars(tracker).items() if value != getattr(TrackerOptions, name)}
-        others = {"config": config, "like": getattr(source, "like", None)}
+        others = {"config": config, "settings": getattr(source, "settings", None)}
         for name, value in (given | {name: value for name, value in others.items() if value is not None}).items():
             raise InputError(f"--{name} {value}: goes without a result, which is made by it")
         with working("reading"):

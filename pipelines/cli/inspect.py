@@ -90,9 +90,8 @@ def inspect_table(
     if survey.raw.present("ego_x").any() and "coordinates" not in survey.raw.columns and not survey.how.coordinates:
         typer.echo("\nPositions are taken for world coordinates; if the vehicle is their origin: --coordinates ego")
     if survey.dense_traffic and not survey.has_identities:
-        typer.echo(
-            f"\nDense road traffic: {survey.dense_traffic}. `track`, `smooth` have settings for it; --like plain: not."
-        )
+        told = "`track`, `smooth` have settings for it; --settings plain: not."
+        typer.echo(f"\nDense road traffic: {survey.dense_traffic}. {told}")
     base_option = "" if import_file is None else f" --import {shlex.quote(str(import_file))}"
     _show_next(survey, table, base_option + _mended(survey, findings, given).options())
 
@@ -162,20 +161,18 @@ def _mended(survey: TableSurvey, findings: Sequence[Finding], given: TableImport
     mends = [finding.mend for finding in findings if finding.mend is not None]
     if survey.raw.clock.guessed:
         mends.insert(0, Mend(units={"time": survey.raw.clock.unit}))
+    mends.append(survey.raw.found.open)
     names, how, changed = survey.raw.found.names, survey.how, {"sort"}
     for mend in mends:
         how = how.mended(mend, names)
         changed |= {name for name, value in vars(mend).items() if value}
-    if survey.raw.found.open:
-        how = replace(how, columns={**how.columns, **survey.raw.found.open})
-        changed.add("columns")
     return replace(given, **{name: getattr(how, name) for name in changed})
 
 
 def _show_next(survey: TableSurvey, table: Path, options: str) -> None:
     name = shlex.quote(str(table))
     command = survey.raw.argoverse_command()
-    to_mend = survey.faults and not survey.raw.found.open
+    to_mend = survey.faults and not survey.raw.found.open.columns
     unknown = FILL_IN in options + command
     text = ", when the table is mended" if to_mend else f", with what fits in place of {FILL_IN}" if unknown else ""
     typer.echo(f"\nNext{text}:")

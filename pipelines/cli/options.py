@@ -120,19 +120,19 @@ class TrackerOptions(MethodOptions):
 def family_of(source: DatasetSource, config: Path | None, method: Method) -> str | Path:
     """The shipped settings that fit a dataset, which the file `config` lies over.
 
-    A table has those that `--like` names. One of dense traffic has its own, which is told. With such a file, whose
+    A table has those that `--settings` names. One of dense traffic has its own, which is told. With such a file, whose
     meaning depends on no data, it is told how to have them. The method centerpoint has settings of its own.
     """
     if not isinstance(source, DetectionFileSource) or method == "centerpoint":
         return source.family
-    if source.like is not None:
-        return "dense" if source.like == "dense" else source.family
+    if source.settings is not None:
+        return "dense" if source.settings == "dense" else source.family
     why = source.dense_traffic()
     if why and config is None:
-        typer.echo(f"settings for dense traffic: {why}; --like plain takes others", err=True)
+        typer.echo(f"settings for dense traffic: {why}; --settings plain takes others", err=True)
         return "dense"
     if why:
-        typer.echo(f"{config}: over plain settings; {why}: --like dense takes those for dense traffic", err=True)
+        typer.echo(f"{config}: over plain settings; {why}: --settings dense takes those for dense traffic", err=True)
     return source.family
 
 

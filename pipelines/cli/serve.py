@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from data_tools.datasets.detection_file_source import LIKE_TEXT
+from data_tools.datasets.detection_file_source import SETTINGS_TEXT
 from data_tools.datasets.mcap import DEFAULT_EGO, WORLD, RecordingOptions, sensor_topics
 from pipelines.checks import Checks
 from pipelines.cli import options as how
@@ -81,12 +81,12 @@ class ServiceOptions:
         ),
     ] = None
     learn_offsets: how.LearnOffsetsOption = None
-    like: Annotated[
+    settings: Annotated[
         Literal["plain", "dense"] | None,
         typer.Option(
-            "--like",
-            help=f"{LIKE_TEXT}; --config lies over them.  [default: plain, and the log says if the first frames look "
-            "dense]",
+            "--settings",
+            help=f"{SETTINGS_TEXT}; --config lies over them.  [default: plain, and the log says if the first frames "
+            "look dense]",
         ),
     ] = None
 
@@ -247,14 +247,14 @@ def _run(
             handler.addFilter(LogLimitFilter())
     method = tracker.method
     how.check_learn_offsets(service.learn_offsets, method)
-    family = "dense" if service.like == "dense" else "file"
+    family = "dense" if service.settings == "dense" else "file"
     settings = tracker.configured(family, config)
-    if service.like is not None and config is not None:
-        typer.echo(f"{config}: over the settings of --like {service.like}", err=True)
+    if service.settings is not None and config is not None:
+        typer.echo(f"{config}: over --settings {service.settings}", err=True)
     bounds = StreamSettings() if service.limits is None else load_settings(StreamSettings, service.limits)
     if service.reorder is not None:
         bounds = replace(bounds, reorder=service.reorder)
-    undecided = service.like is None and config is None and method != "centerpoint"
+    undecided = service.settings is None and config is None and method != "centerpoint"
     checks = Checks(settings.of_method(method), load_config(family), option_for, undecided)
     stream: StreamTracker[Any] = StreamTracker(lambda: settings.new_tracker(method), bounds, checks, **answers)
     return_large_blocks()

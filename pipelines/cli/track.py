@@ -130,7 +130,7 @@ class Summary:
         counts = (counted(self.scenes, "scene"), counted(self.frames, "frame"), tracks, counted(self.boxes, "box"))
         typer.echo(f"{self.output}: {', '.join(counts)}{rate}")
         if self.detections and not self.boxes:
-            typer.echo(NO_TRACKS.format(self.detections, "--like dense, for own tables,"), err=True)
+            typer.echo(NO_TRACKS.format(self.detections, "--settings dense, for own tables,"), err=True)
         for name, scales in self.noise.items():
             typer.echo(
                 f"noise of {name}: {np.median(scales):.2g} of what its model says, by its successive detections; "

@@ -24,6 +24,7 @@ import numpy as np
 from saga_fg.errors import InputError, require_type
 from saga_fg.numerics import FloatArray
 from saga_fg.settings import Settings, setting, settings_group
+from saga_fg.tables.plausibility import COUNTS
 from saga_fg.types import FILL_IN, Finding, Mend
 
 Kind = Literal["time", "length", "speed", "angle", "score"]
@@ -216,14 +217,14 @@ class Columns:
     units   by our name, where the file's name ends in one
     unread  columns of the file that have no meaning here
     faults  what is wrong with the names, a text each
-    open    by our name, the file's name that mends a fault, `FILL_IN` where it is not known
+    open    what mends the faults: the file's name of columns, `FILL_IN` where it is not known
     """
 
     names: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     unread: tuple[str, ...] = ()
     faults: tuple[str, ...] = ()
-    open: Mapping[str, str] = field(default_factory=dict)
+    open: Mend = field(default_factory=Mend)
 
 
 COMMAND = "--"
@@ -274,6 +275,7 @@ def understood(
     chosen: dict[str, str] = {}
     faults: list[str] = []
     mends: dict[str, str] = {}
+    units: dict[str, str] = {}
     for ours, name in given.items():
         if name in names and ours in columns:
             chosen[ours] = name
@@ -310,15 +312,19 @@ def understood(
                 faults.append(f"unknown column {name[:40]!r}; did you mean {nearest[0]!r}? ({mend})")
     missing = [ours for ours in required if ours not in chosen and ours not in possible]
     if missing:
-        mends |= dict.fromkeys(missing, FILL_IN)
         there = ", ".join(name[:40] for name in sorted(names)[:12]) or "none"
         there += f", ... ({len(names)} in all)" if len(names) > 12 else ""
         wanted = " and ".join(f"a column {ours!r}" for ours in missing)
-        mend = f"; name it: {naming(dict.fromkeys(missing, 'NAME'))}" if names else ""
+        counted = next((name for name in unread if _plain(name) in COUNTS and "timestamp" in missing), "")
+        mends |= dict.fromkeys(missing, FILL_IN) | ({"timestamp": counted} if counted else {})
+        units = {"time": "10Hz"} if counted else {}  # as many frames a second, to be changed
+        named = {ours: "NAME" if mends[ours] == FILL_IN else mends[ours] for ours in missing}
+        mend = f"; name it: {option_text({'columns': named} | ({'units': units} if counted else {}), within)}"
+        mend = mend if names else ""
         faults.insert(0, f"expected {wanted}, the columns there are {there}{mend}")
     ends = {ours: _unit_at_end(ours, name) for ours, name in chosen.items()}
-    units = {ours: unit for ours, unit in ends.items() if unit is not None}
-    return Columns(chosen, units, tuple(unread), tuple(faults), mends)
+    in_names = {ours: unit for ours, unit in ends.items() if unit is not None}
+    return Columns(chosen, in_names, tuple(unread), tuple(faults), Mend(columns=mends, units=units))
 
 
 def option_text(entries: Mapping[str, Any], within: str = COMMAND) -> str:

@@ -17,6 +17,7 @@ from saga_fg.tables.plausibility import (
     FEWEST,
     far_too_fast,
     length_below_width,
+    repeated_rows,
     scores_beyond_one,
     share,
     strange_time_steps,
@@ -411,7 +412,8 @@ def findings_of(sample: Sample, logits: Callable[[str], bool] = lambda sensor: F
     )
     with_yaw = np.isfinite(sample.yaw)
     sides = length_below_width(label[with_yaw], boxes.size[with_yaw])
-    found = [scores_beyond_one(sample.score[shares]), sides, *scale]
+    repeated = repeated_rows(sample.frame, boxes, sample.score)
+    found = [scores_beyond_one(sample.score[shares]), sides, repeated, *scale]
     if any(scale):
         return [finding for finding in (*found, headings_in_degrees(sample.yaw)) if finding is not None]
     turned = headings_in_degrees(sample.ego_yaw, "ego_yaw")  # places in the world depend on it

@@ -114,7 +114,7 @@ def plain_settings() -> TrackerSettings:
     return TrackerSettings(min_hits=2)
 
 
-Like = Literal["plain", "dense"]
+TableSettings = Literal["plain", "dense"]
 """Settings by name: `plain_settings`, or `dense_traffic_settings`."""
 
 UNKNOWN_SENSORS: Mapping[str, Sensor] = {DEFAULT: Sensor(calibrate_noise=True, clutter_area=5000.0)}
@@ -130,7 +130,7 @@ UNNAMED = "object"
 
 def track(
     detections: Table,
-    settings: TrackerSettings | Like | None = None,
+    settings: TrackerSettings | TableSettings | None = None,
     sensors: Mapping[str, Sensor] | None = None,
     how: TableImport | None = None,
     method: Method = "saga",
@@ -175,7 +175,7 @@ def predict(
     horizons: ArrayLike = HORIZONS,
     times: ArrayLike | None = None,
     modes: bool = False,
-    settings: TrackerSettings | Like | None = None,
+    settings: TrackerSettings | TableSettings | None = None,
     sensors: Mapping[str, Sensor] | None = None,
     how: TableImport | None = None,
     method: Method = "saga",
@@ -220,7 +220,7 @@ def predict(
     return table_like(detections, parts or [found.named("", PredictedTracks.empty(0.0, ahead).table_columns(modes))])
 
 
-def _tell_default(settings: TrackerSettings | Like | None) -> None:
+def _tell_default(settings: TrackerSettings | TableSettings | None) -> None:
     """Warn, at the caller's caller, of a default that fits no table, where others were changed."""
     usual = TrackerSettings()
     if isinstance(settings, TrackerSettings) and settings != usual and settings.min_hits == usual.min_hits:
@@ -259,7 +259,7 @@ class TableScenes(NamedTuple):
 def read_scenes(
     detections: Table,
     how: TableImport | None,
-    settings: TrackerSettings | Like | None,
+    settings: TrackerSettings | TableSettings | None,
     sensors: Mapping[str, Sensor] | None,
     method: Method,
 ) -> TableScenes:
@@ -269,8 +269,8 @@ def read_scenes(
     """
     if method not in get_args(Method):
         raise InputError(f"method: expected one of {', '.join(get_args(Method))}, got {method!r}")
-    if isinstance(settings, str) and settings not in get_args(Like):
-        raise InputError(f"settings: expected {' or '.join(get_args(Like))} or TrackerSettings, got {settings!r}")
+    if isinstance(settings, str) and settings not in get_args(TableSettings):
+        raise InputError(f"settings: expected plain, dense or TrackerSettings, got {settings!r}")
     if not isinstance(settings, str | None):
         require_type("settings", settings, TrackerSettings)
     if method == "centerpoint" and settings is not None:
@@ -282,7 +282,7 @@ def read_scenes(
     undecided = (settings is None or own) and method != "centerpoint"
     why = seems_dense_traffic(scenes[0].frames) if scenes and undecided else ""
     if why and own:
-        what = "settings: dense_traffic_settings() of saga_fg.tracking fit better than those given"
+        what = "settings: dense_traffic_settings() of saga_fg.tracking may fit better than those given"
         warnings.warn(f"{what}, as 'dense' does: {why}", stacklevel=3)
     elif why:
         warnings.warn(f"settings for dense traffic: {why}; settings='plain' takes others", stacklevel=3)

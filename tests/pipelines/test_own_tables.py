@@ -319,6 +319,14 @@ def test_looks_at_true_objects_at_none_and_at_scattered_dates(tmp_path):
     assert "Next, when the table is mended:" in look.stdout
 
 
+def test_a_count_of_frames_is_proposed_as_time_with_its_rate(tmp_path):
+    table = tmp_path / "d.csv"
+    table.write_text("frame,label,x,y\n" + "".join(f"{k},car,{k},0\n" for k in range(9)))
+    look = saga_fg("inspect", table).stdout
+    assert f"saga-fg track file {table} --columns timestamp=frame --units time=10Hz --output tracks.csv" in look
+    assert "name it: --columns timestamp=frame --units time=10Hz\n" in look
+
+
 def test_a_look_at_a_table_with_faults_shows_what_is_understood(tmp_path):
     table = tmp_path / "d.csv"
     table.write_text("when,x,y,lenght,label,score\n0,1,2,4.5,car,high\n1,1.5,2,4.5,car,0.5\n")
@@ -486,14 +494,14 @@ def test_dense_traffic_is_recognised_unless_it_is_said_otherwise(tmp_path):
     told, same = tmp_path / "told.csv", tmp_path / "same.csv"
     line = "settings for dense traffic: 10 vehicles at a time with headings"
     assert saga_fg("track", "file", table, "--output", told).output.count(line) == 1
-    saga_fg("track", "file", table, "--like", "dense", "--output", same)
+    saga_fg("track", "file", table, "--settings", "dense", "--output", same)
     assert same.read_bytes() == told.read_bytes()
     config = tmp_path / "c.yaml"
     config.write_text("tracker: {max_coasting: 3.0}\n")
     said = saga_fg("track", "file", table, "--config", config, "--output", tmp_path / "own.csv").output
     assert f"{config}: over plain settings; 10 vehicles at a time with headings" in said
-    assert "--like dense takes those for dense traffic" in said
-    assert "settings for" not in saga_fg("track", "file", table, "--like", "plain", "--output", same).output
+    assert "--settings dense takes those for dense traffic" in said
+    assert "settings for" not in saga_fg("track", "file", table, "--settings", "plain", "--output", same).output
     assert same.read_bytes() != told.read_bytes()
     assert "settings for" not in saga_fg("track", "file", table, "--method", "centerpoint", "--output", same).output
 
@@ -505,7 +513,7 @@ def test_labels_of_dense_traffic_begin_with_its_settings_as_those_of_a_program_d
     table.write_text("\n".join(["timestamp,label,x,y,yaw,lane", *rows]) + "\n")
     found = {}
     for like in (None, "dense", "plain"):
-        options = () if like is None else ("--like", like)
+        options = () if like is None else ("--settings", like)
         said = saga_fg("smooth", "file", table, *options, "--output", tmp_path / f"labels-{like}")
         assert said.exit_code == 0, said.output
         assert said.output.count("settings for dense traffic: 10 vehicles at a time with headings") == (like is None)

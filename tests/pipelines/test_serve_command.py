@@ -291,9 +291,14 @@ def test_settings_for_dense_traffic_are_those_of_track_and_a_file_lies_over_them
     config = tmp_path / "c.yaml"
     config.write_text("tracker: {min_hits: 4}\n")
     cases: Any = [
-        (("--like", "dense"), "dense", None, ""),
-        (("--like", "plain"), "file", None, ""),
-        (("--like", "dense", "--config", config), "dense", config, f"{config}: over the settings of --like dense"),
+        (("--settings", "dense"), "dense", None, ""),
+        (("--settings", "plain"), "file", None, ""),
+        (
+            ("--settings", "dense", "--config", config),
+            "dense",
+            config,
+            f"{config}: over --settings dense",
+        ),
     ]
     for options, family, own, said in cases:
         out, errors = run("serve", *options, given=stream)

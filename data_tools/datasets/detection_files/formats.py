@@ -3,6 +3,7 @@
 import codecs
 import csv
 import logging
+import re
 import shlex
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -145,13 +146,34 @@ def _tables(reading: _Reading) -> Iterator[RawTable]:
     }
     path = reading.path
     if path.suffix.lower() not in readers:
-        raise InputError(f"{path}: expected a file name that ends in {', '.join(readers)}")
+        raise InputError(f"{path}: expected a file name that ends in {', '.join(readers)}{_of_a_dataset(path)}")
     try:
         yield from readers[path.suffix.lower()](reading)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: expected text in UTF-8{_foreign_line(path)}") from error
+
+
+_OF_DATASETS = (
+    (re.compile(r"\d+[ ,]-?\d+[ ,][A-Z][a-z_]+[ ,]"), "KITTI", "kitti"),
+    (re.compile(r"\d+(,-?[0-9.e+-]+){5,}$"), "MOTChallenge", "motchallenge"),
+    (re.compile(r"\{.*\"(results|meta)\""), "nuScenes", "nuscenes"),
+)
+"""What the first line of a file of a dataset begins with, its name, and its command."""
+
+
+def _of_a_dataset(path: Path) -> str:
+    """Error message for a file in the format of a dataset: the command that reads it; "" for others."""
+    try:
+        with open_bytes(path) as file:
+            line = file.readline(1000).decode(errors="replace").strip()
+    except (OSError, InputError):
+        return ""
+    for begins, name, command in _OF_DATASETS:
+        if begins.match(line):
+            return f"; its first line looks like one of {name}, which `saga-fg track {command} --help` reads"
+    return ""
 
 
 def _foreign_line(path: Path) -> str:

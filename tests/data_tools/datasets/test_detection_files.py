@@ -337,6 +337,20 @@ def test_npz_that_is_none(tmp_path):
         read_detections(path)
 
 
+@pytest.mark.parametrize(
+    ("line", "command"),
+    [
+        ("0 3 Car 0 0 -10 100 100 200 200 1.6 1.9 4.5 2.0 1.6 9.0 0.0 0.9", "kitti"),
+        ("1,-1,794.2,47.5,71.2,174.8,0.7,-1,-1,-1", "motchallenge"),
+        ('{"meta": {"use_camera": false}, "results": {', "nuscenes"),
+    ],
+)
+def test_files_of_datasets_are_named(tmp_path, line, command):
+    (tmp_path / "drive.txt").write_text(f"{line}\n")
+    with pytest.raises(InputError, match=f"which `saga-fg track {command} --help` reads"):
+        read_detections(tmp_path / "drive.txt")
+
+
 def test_other_files(tmp_path):
     with pytest.raises(InputError, match=r"drive\.txt: expected a file name that ends in \.csv, \.ndjson"):
         read_detections(tmp_path / "drive.txt")

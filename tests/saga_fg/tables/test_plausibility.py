@@ -17,6 +17,7 @@ from saga_fg.tables.plausibility import (
     far_too_fast,
     idle_rules,
     length_below_width,
+    repeated_rows,
     scores_beyond_one,
     settings_without_data,
     strange_time_steps,
@@ -192,6 +193,17 @@ def test_scores_beyond_one(subtests):
             finding = scores_beyond_one(score)
             assert (finding is None) == (what is None)
             assert finding is None or f"look like {what}" in finding.what
+
+
+def test_repeated_rows():
+    frame, score = np.arange(60) // 6, RNG.uniform(0, 1, 60)
+    boxes = Boxes.of(CARS, RNG.normal(0, 9, (60, 3)))
+    assert repeated_rows(frame, boxes, score) is None
+    twice = np.r_[0:60, 0:30]
+    found = repeated_rows(frame[twice], boxes.select(twice), score[twice])
+    assert found is not None
+    assert found.what.startswith("30 of the first 90 detections are repeated")
+    assert repeated_rows(frame[twice], boxes.select(twice), RNG.uniform(0, 1, 90)) is None, "as of two detectors"
 
 
 def test_length_below_width(subtests):

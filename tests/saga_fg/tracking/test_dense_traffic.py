@@ -61,7 +61,7 @@ def test_a_table_of_it_is_tracked_with_its_settings():
         found = track(table)
     by_name = track(table, dense_traffic_settings())
     assert found.equals(by_name)
-    with pytest.warns(UserWarning, match="dense_traffic_settings.. of saga_fg.tracking fit better than those given"):
+    with pytest.warns(UserWarning, match="dense_traffic_settings.. of saga_fg.tracking may fit better"):
         assert not found.equals(track(table, TrackerSettings(min_hits=2)))
 
 

@@ -164,7 +164,7 @@ def test_what_cannot_be_predicted_is_named(subtests):
         ({"how": {"columns": {"x": "east"}}}, "how: expected TableImport, got dict"),
         ({"method": "centerpoint"}, "method: expected saga or kf, centerpoint predicts nothing"),
         ({"method": "sage"}, "method: expected one of saga, kf, centerpoint, got 'sage'"),
-        ({"settings": "thin"}, "settings: expected plain or dense or TrackerSettings, got 'thin'"),
+        ({"settings": "thin"}, "settings: expected plain, dense or TrackerSettings, got 'thin'"),
     ]:
         with subtests.test(message), pytest.raises(InputError, match=re.escape(message)):
             saga_fg.predict(rows, **arguments)
