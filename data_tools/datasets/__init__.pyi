@@ -30,7 +30,7 @@ from .detection_files import (
 )
 from .detection_files.dataset import TableSurvey, survey_table
 from .given_tracks import GivenTracks, TrackedRecordings, detected, read_given_tracks, sensor_names, tracked_parts
-from .labelling_tools import exchanged, read_from_tool, tool_format, write_for_tool
+from .labelling_tools import exchanged, read_from_tool, tool_format, tools_of, write_for_tool
 from .results import Results, SceneResult, clear_figures, scene_result, table_results
 from .source import (
     AreaMap,
@@ -97,6 +97,7 @@ __all__ = [
     "survey_table",
     "table_results",
     "tool_format",
+    "tools_of",
     "tracked_parts",
     "true_scene",
     "write_correction_lines",

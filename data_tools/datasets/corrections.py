@@ -184,9 +184,13 @@ class Edits:
     def _changes(self, before: IntArray, after: IntArray) -> Iterator[Record]:
         """Changes of a part of an object, of boxes by their rows before and after."""
         ours, theirs = self.ours.boxes, self.theirs.boxes
-        ((label, _),) = Counter(theirs.label[after].tolist()).most_common(1)
-        if label != ours.label[before[0]]:
+        was, labels = str(ours.label[before[0]]), Counter(theirs.label[after].tolist())
+        ((label, most),) = labels.most_common(1)
+        if label != was:
             yield self._about("class", _middle(before.tolist()), label=label)
+        if others := labels.total() - most - (label != was) * labels[was]:
+            id_ = self.ours.id[before[0]]
+            self.problems.append(f"object {id_}: {others} boxes of another class: an object has one, here {label}")
         moved, turned, resized = _changed(ours.select(before), theirs.select(after))
         if resized.any():
             ((size, _),) = Counter(tuple(s) for s in theirs.size[after[resized]].round(2).tolist()).most_common(1)

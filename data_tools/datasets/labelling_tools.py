@@ -17,7 +17,7 @@ rx, ry, rz, and sx, sy, sz); https://docs.cvat.ai/docs/dataset_management/format
 """
 
 import json
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -54,13 +54,23 @@ class ToolFormat:
     suffix  of the file of a scene; "" for a folder
     write   takes the path, the scene, and its boxes by frame in coordinates of the vehicle
     read    yields the frames of a path, by name, and their boxes
+    inside  what the folder of a scene holds; "" for a file
     clouds  folder of the point clouds in that of the scene, "" for none
     """
 
     suffix: str
     write: Callable[[Path, Scene, Sequence[Sequence[ToolBox]]], None]
     read: Callable[[Path], Iterator[tuple[str, list[ToolBox]]]]
+    inside: str = ""
     clouds: str = ""
+
+    def scene_path(self, folder: Path, name: str) -> Path:
+        """Return the file or folder of a scene by its name as a file, whether it is there or not."""
+        return folder / f"{name}{self.suffix}"
+
+    def holds(self, folder: Path, name: str) -> bool:
+        """Return whether a scene is there."""
+        return (self.scene_path(folder, name) / self.inside).exists()
 
 
 def tool_format(name: str) -> ToolFormat:
@@ -68,6 +78,12 @@ def tool_format(name: str) -> ToolFormat:
     if name not in _FORMATS:
         raise InputError(unknown_name("labelling tool", name, tuple(_FORMATS)))
     return _FORMATS[name]
+
+
+def tools_of(folder: Path, names: Iterable[str]) -> list[str]:
+    """The tools in whose form a folder holds scenes, by their names as files."""
+    scenes = tuple(names)
+    return [tool for tool, form in _FORMATS.items() if any(form.holds(folder, name) for name in scenes)]
 
 
 def exchanged(result: SceneResult) -> SceneResult:
@@ -275,6 +291,6 @@ def _read_sustechpoints(path: Path) -> Iterator[tuple[str, list[ToolBox]]]:
 
 _FORMATS = {
     "openlabel": ToolFormat(".json", _write_openlabel, _read_openlabel),
-    "cvat": ToolFormat("", _write_cvat, _read_cvat, "pointcloud"),
-    "sustechpoints": ToolFormat("", _write_sustechpoints, _read_sustechpoints, "lidar"),
+    "cvat": ToolFormat("", _write_cvat, _read_cvat, "annotations", "pointcloud"),
+    "sustechpoints": ToolFormat("", _write_sustechpoints, _read_sustechpoints, "label", "lidar"),
 }

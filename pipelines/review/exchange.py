@@ -4,6 +4,7 @@ Labels can be made again from the record of their run: the configuration of its 
 """
 
 import json
+import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -28,6 +29,7 @@ from data_tools.datasets import (
     read_tracks,
     scene_result,
     tool_format,
+    tools_of,
     write_correction_lines,
     write_for_tool,
 )
@@ -43,6 +45,8 @@ from saga_fg.numerics import FloatArray, transform_points
 from saga_fg.parts import part_name
 from saga_fg.smoothing.corrections import correction_from
 from saga_fg.types import Dataset, Scene
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -143,7 +147,7 @@ def export_labels(folder: Path, run: LabelRun, tool: str, output: Path) -> tuple
         scans = source.surroundings(scenes).scans() if form.clouds else {}
         for result in labelled_scenes(folder, scenes):
             name = file_name(result.scene.name)
-            boxes += write_for_tool(whole / f"{name}{form.suffix}", tool, result)
+            boxes += write_for_tool(form.scene_path(whole, name), tool, result)
             every += len(result.found)
             for k, time in enumerate(result.scene.timestamps.tolist()):
                 points = ego_points(scans.get(result.scene.name), time)
@@ -171,8 +175,8 @@ def import_edits(
         labels = {label for each in results for label in each.found.boxes.label.tolist()}
         fixed = source.written.classes
     for result in results:
-        path = given / f"{file_name(result.scene.name)}{form.suffix}"
-        if not path.exists():
+        path = form.scene_path(given, file_name(result.scene.name))
+        if not form.holds(given, file_name(result.scene.name)):
             missing.append(path)
             problems.append(f"{path}: there is no such scene, its labels stay as they are")
             continue
@@ -181,11 +185,12 @@ def import_edits(
         checked = [(each, correction_from(each, str(path))) for each in compared.corrections()]
         problems += [f"{one}: {one.too_far}: left out" for _, one in checked if one.too_far]
         found += [record for record, one in checked if not one.too_far]
-        unknown = sorted(set(back[0].boxes.label.tolist()) - labels) if not fixed else []
-        problems += [f"{path}: class {name}: taken over, no label has had it before" for name in unknown]
+        for name in sorted({one.label for _, one in checked if one.label and not one.too_far} - labels):
+            log.warning("%s: class %s: taken over, no label has had it before", path, name)
         problems += [f"{path}: {line}" for line in compared.problems]
     if len(missing) == len(results):
-        raise InputError(f"{given}: expected {missing[0].name}, as written by --export {tool}")
+        other = "".join(f"; this is of {name}" for name in tools_of(given, map(file_name, scenes)))
+        raise InputError(f"{given}: expected {missing[0].name}, as written by --export {tool}{other}")
     lines = correction_lines(file)
     there = [_plain(parsed_json(line, str(file))) for line in lines if line.strip()]
     new = [record for record in found if record not in there]

@@ -544,6 +544,9 @@ def test_what_is_wrong_with_a_tool_or_its_files_is_one_line(labels, tmp_path):
     assert "unknown labelling tool 'cavt'; did you mean 'cvat'?" in refused("review", labels, "--export", "cavt", out)
     assert not out.exists()
     assert f"{out}: expected a.json, as written by" in refused("review", labels, "--import", "openlabel", out)
+    done("review", labels, "--export", "sustechpoints", tmp_path / "other")
+    of_another = "expected a, as written by --export cvat; this is of sustechpoints"
+    assert of_another in refused("review", labels, "--import", "cvat", tmp_path / "other")
     assert "expected one of" in refused("review", labels, "--export", "cvat", out, "--import", "cvat", out)
     done("review", labels, "--export", "openlabel", out)
     (out / "b.json").unlink()
@@ -560,7 +563,14 @@ def test_what_is_wrong_with_a_tool_or_its_files_is_one_line(labels, tmp_path):
     (out / "a.json").write_text(whole.replace('"type": "car"', '"type": "kart"'))
     told = done("review", labels, "--import", "openlabel", out)
     assert "class kart: taken over, no label has had it before" in told.stderr
+    assert "not taken over: " + str(out / "a.json") not in told.stderr
     assert "3 class" in told.output
+    (out / "a.json").unlink()
+    (labels / CORRECTIONS).unlink()
+    for file in (tmp_path / "other" / "a" / "label").glob("*4.json"):
+        file.write_text(file.read_text().replace('"obj_type": "car"', '"obj_type": "kart"'))
+    told = done("review", labels, "--import", "sustechpoints", tmp_path / "other")
+    assert "boxes of another class: an object has one, here car" in told.stderr
 
 
 def test_scans_go_out_in_the_coordinates_of_the_boxes(labels, tmp_path, monkeypatch):
