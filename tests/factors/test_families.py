@@ -222,41 +222,6 @@ def test_noisy_increments_do_not_pull_at_the_scale():
     assert scale == pytest.approx(0.05, abs=4 * 0.1 / (0.1 * np.sqrt(n)))
 
 
-def test_pose_and_objects_are_recovered_together():
-    """A vehicle that knows where it started and sees three objects that stand finds its scale error."""
-    rng = np.random.default_rng(3)
-    objects = np.array([[10.0, 4, 0, 0], [14.0, -6, 0, 0], [25.0, 3, 0, 0]])
-    truth = [gtsam.Pose3(gtsam.Rot3.Yaw(0.05 * k), np.array([2.0 * k, 0.1 * k * k, 0.3])) for k in range(5)]
-    step = np.stack([truth[k].between(truth[k + 1]).matrix() for k in range(4)])
-    reported = step.copy()
-    reported[:, :3, 3] *= 1.2
-    poses, errors, names = range(5), range(5, 10), np.arange(10, 13)
-    noise = np.diag([1e-6] * 3 + [1e-4] * 3 + [1e-8] * 3)
-    odometry = odometry_factors(
-        np.column_stack([poses[:-1], poses[1:], errors[:-1], errors[1:]]), reported, np.full(4, 0.5), noise
-    )
-    rows = np.array([[k, name] for k in poses for name in names])
-    z = [truth[k].transformTo(np.append(objects[name - 10, :2], 1.0)) for k, name in rows]
-    seen = relative_factors(rows, z, 1e-4 * np.eye(2), 4)
-    linear = prior_factors([5], np.zeros((1, 3)), np.eye(3)).native()
-    linear += prior_factors(names, np.zeros((3, 4)), 1e4 * np.eye(4)).native()
-    graph = nonlinear_graph(linear, {5: 3, **dict.fromkeys(names.tolist(), 4)})
-    graph.add(gtsam.PriorFactorPose3(0, truth[0], gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)))
-    start = gtsam.Values()
-    for k in poses:
-        start.insert(k, truth[0])
-        start.insert(5 + k, np.zeros(3))
-    for name in names.tolist():
-        start.insert(name, objects[name - 10] + np.append(rng.normal(0, 1, 2), [0, 0]))
-    solution = solve(graph, [odometry, seen], start)
-    assert solution.converged
-    assert solution.values.atVector(9)[0] == pytest.approx(0.2, abs=1e-3)
-    for k in poses:
-        np.testing.assert_allclose(solution.values.atPose3(k).matrix(), truth[k].matrix(), atol=2e-3)
-    for name in names.tolist():
-        np.testing.assert_allclose(solution.values.atVector(name)[:2], objects[name - 10, :2], atol=2e-3)
-
-
 THERE = Bearing(4, sensor_pose=(1.0, 1.0, 0.0))
 
 

@@ -126,21 +126,6 @@ def test_bad_steps_are_refused_by_name(covariance):
             interaction_factors(**{**good, **change})
 
 
-def test_incremental_solver_agrees_from_any_initial_value(covariance):
-    rng = np.random.default_rng(4)
-    factors = [prior_factor(0, [1.0, 2.0], covariance(rng, 2)), prior_factor(1, [3.0, -1.0], covariance(rng, 2))]
-    factors.append(interaction_factor(2, [1, 0], [np.eye(2), 0.3 * np.eye(2)], [5.0, 6.0], covariance(rng, 2)))
-    isam = gtsam.ISAM2()
-    for start in range(3):
-        values = gtsam.Values()
-        values.insert(start, 10 * rng.normal(size=2))
-        isam.update(nonlinear_graph([factors[start]], {0: 2, 1: 2, 2: 2}), values)
-    estimate = isam.calculateBestEstimate()
-    solution = gaussian_graph(factors).optimize()
-    for key in range(3):
-        np.testing.assert_allclose(estimate.atVector(key), solution.at(key), atol=1e-9)
-
-
 def test_increments_from_a_point_keep_their_meaning():
     rng = np.random.default_rng(5)
     graph, point, moved = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Values()

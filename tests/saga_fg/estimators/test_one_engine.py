@@ -25,7 +25,6 @@ from saga_fg.numerics.arrays import FloatArray
 from saga_fg.tracking.journal import Event, Journal
 from saga_fg.types.track import Tracks
 from tests.saga_fg.estimator_scenario import Textbook, assert_newest, random_covariance, tell
-from tests.saga_fg.estimators.soak import LAGS, drive
 from tests.saga_fg.traffic_frames import run as damped_run
 from tests.saga_fg.traffic_frames import seen as damped_seen
 from tests.saga_fg.traffic_frames import straight
@@ -90,16 +89,6 @@ def test_an_object_passes_to_isam2_and_back(lag, late):
             assert_newest(estimator, textbook)
         held.append(len(estimator._keys))
     assert held == [0, 2, 0, 2]
-
-
-@pytest.mark.parametrize("lag", LAGS)
-@pytest.mark.parametrize("late", [0.0, 0.3])
-def test_a_long_drive_stays_beside_the_kalman_filter_and_does_not_grow(lag, late):
-    """Births, deaths, ids that come back, edges that come and go, milliseconds beside seconds, snapshots between."""
-    worst, late_ones, largest = drive(1, lag, 100, late)
-    assert worst.max() < 1e-9
-    assert (late_ones > 3) == (late * lag > 0)
-    assert largest <= 20 * (3 + 20 * lag)
 
 
 def test_little_noise_beside_large_variances_costs_no_digits():

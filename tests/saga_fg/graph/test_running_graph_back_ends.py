@@ -1,25 +1,17 @@
 """Laws 1, 3 and 6 of the running graph for every back end that takes providers: they agree, and what goes in acts."""
 
 import itertools
-import pickle
 from dataclasses import replace
 from functools import partial
 
-import gtsam
 import numpy as np
 import pytest
 
 from factors import (
-    RangeBearing,
     ResidualFactors,
     Robust,
     SolverSettings,
-    Vector,
-    between_factor,
     gaussian_factor,
-    pose_prior_factor,
-    relative_factors,
-    residual_factor,
 )
 from saga_fg import Tracker, TrackerSettings
 from saga_fg.conformance.programs import CAR, POLE, TRAM, Add, TextbookEstimator, random_program
@@ -102,67 +94,6 @@ def test_linear_factors_of_providers_lead_to_one_estimate(seed, name):
     assert np.abs(mean - apart.joint_mean(nodes)).max() > 0.01
 
 
-class Drive:
-    """The vehicle's pose by odometry, a post in range and bearing, and the objects in range and bearing from it."""
-
-    name = "drive"
-
-    def __init__(self, noise=1.0):
-        self.noise, self.pose = noise, None
-
-    @staticmethod
-    def true(view, t):
-        return gtsam.Pose2(2.0 * t - view.origin[0], 0.1 * t - view.origin[1], 0.05 * t)
-
-    def factors(self, view):
-        t, P, here = view.time, self.noise * np.diag([0.02, 0.02, 0.002]) ** 2, view.key(EGO_POSE, 0)
-        true, there = self.true(view, t), np.array([12.0, -4.0]) - view.origin
-        before, new, factors = view.before(EGO_POSE), [], []
-        if before:
-            moved = self.true(view, before[0].time).between(true)
-            new.append(NewVariable(EGO_POSE, 0, view.state(before[0].key).compose(moved)))
-            factors.append(between_factor(before[0].key, here, moved.matrix(), P))
-            self.pose = before[0], view.state(before[0].key), view.covariance(before[0].key)
-        else:
-            new.append(NewVariable(EGO_POSE, 0, true))
-            factors.append(pose_prior_factor(here, true.matrix(), 10 * P))
-        post = view.key(LANDMARK, 1, static=True)
-        if not view.static(LANDMARK):
-            new.append(NewVariable(LANDMARK, 1, there + 0.1 * np.sqrt(self.noise), static=True))
-        R = self.noise * np.diag([0.01, 0.1]) ** 2
-        noise = gtsam.noiseModel.Gaussian.Covariance(R)
-        factors.append(gtsam.BearingRangeFactor2D(here, post, true.bearing(there), true.range(there), noise))
-        rows = [[here, one.key] for _, one in sorted(view.now(OBJECT).items())]
-        if rows:
-            places = np.array([(15.0 + t, 4.0), (20.0, -6.0 + t)]) - view.origin
-            rows = rows[:2]
-            z = [[true.range(x), true.bearing(x).theta()] for x in places[: len(rows)]]
-            seen_from_it = self.noise * np.diag([0.1, 0.01]) ** 2
-            factors.append(relative_factors(rows, z, seen_from_it, 4, model=RangeBearing(2)))
-        return Additions(new, factors)
-
-
-@pytest.mark.parametrize("noise", [1.0, 0.01])
-def test_poses_and_landmarks_are_blocks_of_the_kalman_filter(noise):
-    """With little noise what is nonlinear is as good as linear: iSAM2's answer in units of its deviations."""
-    cars = straight([(15.0, 4.0), (20.0, -6.0)], [(1.0, 0.0), (0.0, 1.0)])
-    drives = [Drive(noise), Drive(noise)]
-    trackers = [
-        Tracker(TrackerSettings(estimator=name), providers=[drive])
-        for name, drive in zip(("kalman", "isam2"), drives, strict=True)
-    ]
-    for f in seen(np.random.default_rng(1), cars, np.arange(20) / 10, noise=0.1):
-        one, other = (tracker.step(f) for tracker in trackers)
-    sigma = np.sqrt(np.diagonal(other.position_covariance, axis1=1, axis2=2))
-    far = np.abs((one.boxes.position - other.boxes.position)[:, :2] / sigma).max()
-    assert far < 0.2 * np.sqrt(noise)
-    assert one.position_covariance == pytest.approx(other.position_covariance, rel=0.1 * np.sqrt(noise), abs=1e-9)
-    (variable, pose, P), (_, its_pose, its_P) = (drive.pose for drive in drives)
-    way = variable.type.local(its_pose, pose)
-    assert np.abs(way / np.sqrt(np.diag(its_P))).max() < 0.2 * np.sqrt(noise)
-    assert pytest.approx(its_P, rel=0.2 * np.sqrt(noise), abs=1e-9) == P
-
-
 @pytest.mark.parametrize("name", BACK_ENDS)
 def test_the_graph_says_what_the_estimator_knows(name):
     """Law 4: readable names, and solved on its own it comes to the estimate."""
@@ -235,18 +166,6 @@ def test_a_users_range_and_the_interactions_change_what_the_tracker_reports(name
     assert np.abs(state(together) - state(alone))[:2].max() > 1e-3
 
 
-def test_a_linear_factor_leads_every_back_end_to_the_same_tracks():
-    first, *others = (run(tracker(name, Given(towed)), FRAMES) for name in BACK_ENDS)
-    for one, *rest in zip(first, *others, strict=True):
-        sigma = np.sqrt(np.diagonal(one.position_covariance, axis1=1, axis2=2))
-        for other in rest:
-            assert one.id.tolist() == other.id.tolist()
-            assert np.abs((state(one) - state(other))[:, :2] / sigma).max(initial=0.0) < EXACT
-            assert one.position_covariance == pytest.approx(other.position_covariance, rel=1e-8)
-    untold = run(tracker("kalman"), FRAMES)[-1]
-    assert np.abs(state(one) - state(untold)).max() > 0.1
-
-
 @pytest.mark.parametrize("name", BACK_ENDS)
 def test_nodes_of_a_road_map_are_variables_beside_the_tracks(name):
     """Lights, lines and lanes stand still, so that each keeps one variable; cars brake for a line that is moved."""
@@ -314,49 +233,3 @@ def test_what_the_kalman_filter_does_not_take_is_refused_by_name(provider, messa
         run(tracker("kalman", provider), FRAMES[:2])
     for name in ("isam2", "fixed-lag"):
         run(tracker(name, provider), FRAMES)
-
-
-@pytest.mark.parametrize("name", BACK_ENDS)
-def test_what_fails_is_named_and_the_tracker_goes_on(name):
-    """An undetermined landmark, one that is half determined, a residual that is not finite, a provider that raises."""
-    faults = {
-        "landmark 2: not determined by the factors": lambda view, key: Additions([landmark]),  # type: ignore[has-type]
-        r"landmark 2: not determined by the factors \(factors on landmark 2: 1 ": lambda view, key: Additions(
-            [landmark],  # type: ignore[has-type]
-            [gaussian_factor([view.key(LANDMARK, 2, static=True)], [np.eye(1, 2)], [0.0])],
-        ),
-        "provider faulty: wall on car 1 at 0.50 s: .*finite": lambda view, key: Additions(
-            factors=[residual_factor((key,), (Vector(4),), lambda x: [np.nan], np.eye(1), name="wall")]
-        ),
-        "provider faulty: KeyError": lambda view, key: {}[key],
-    }
-    landmark = NewVariable(LANDMARK, 2, np.zeros(2), static=True)
-
-    class Faulty:
-        name = "faulty"
-        now = None
-
-        def factors(self, view):
-            return self.now(view, view.now(OBJECT)[1].key) if self.now else Additions()
-
-    faulty = Faulty()
-    told, untold = tracker(name, faulty), tracker(name, Given(lambda *_: []))
-    for t in (told, untold):
-        run(t, FRAMES[:5])
-    for message, fault in faults.items():
-        faulty.now = fault
-        with pytest.raises(GraphError, match=message):
-            told.step(FRAMES[5])
-        faulty.now = None
-    assert state(told.step(FRAMES[5])) == pytest.approx(state(untold.step(FRAMES[5])), abs=1e-9)
-
-
-@pytest.mark.parametrize("name", BACK_ENDS)
-def test_copies_go_on_alike(name):
-    """With a pose and a landmark in the graph; what looks ahead changes nothing."""
-    one = tracker(name, Drive())
-    run(one, FRAMES[:6])
-    one.tracks(FRAMES[5].timestamp + 0.7)
-    other = pickle.loads(pickle.dumps(one))
-    for f in FRAMES[6:]:
-        assert state(one.step(f)) == pytest.approx(state(other.step(f)), abs=1e-4)

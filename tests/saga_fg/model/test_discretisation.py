@@ -14,17 +14,14 @@ from saga_fg.conformance.programs import (
     BUS,
     CAR,
     CONE,
-    MOVING,
     POLE,
     TRAM,
-    interaction_edges,
-    node_table,
     random_graph,
     random_types,
 )
 from saga_fg.model.discretisation import Blocks, Transition, discretise
 from saga_fg.model.graph_building import joint_generator
-from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity
+from saga_fg.model.interactions import CarFollowing, NodeTable
 
 seeds = st.integers(0, 2**32 - 1)
 intervals = st.one_of(st.floats(1e-9, 1e3), st.sampled_from([0.0, 1e-9, 1e-3, 0.1, 1.0, 1e3]))
@@ -55,28 +52,7 @@ def dense(transition):
     return transition.F_matrix.toarray(), transition.b, transition.Q_matrix.toarray()
 
 
-def in_order_of_components(graph, names, matrix):
-    """The sub-matrix of the named components of all nodes that have them."""
-    offsets = np.concatenate([[0], np.cumsum(graph.dims)])
-    places = [offsets[k] + t.index((name,))[0] for name in names for k, t in enumerate(graph.types) if t.has((name,))]
-    return matrix[np.ix_(places, places)]
-
-
 # without edges
-
-
-@given(intervals)
-def test_constant_velocity_and_acceleration_in_closed_form(dt):
-    F, b, Q = dense(discretise(SceneGraph.of([4], CAR), dt))
-    eye, q = np.eye(2), 1.5
-    assert np.allclose(F, np.block([[eye, dt * eye], [0 * eye, eye]]), rtol=1e-13, atol=0)
-    assert np.allclose(Q, q * np.kron([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]], eye), rtol=1e-12, atol=1e-300)
-    assert not b.any()
-    F, _, Q = dense(discretise(SceneGraph.of([4], BUS), dt))
-    eye, q = np.eye(2), 0.4
-    one_axis = [[dt**5 / 20, dt**4 / 8, dt**3 / 6], [dt**4 / 8, dt**3 / 3, dt**2 / 2], [dt**3 / 6, dt**2 / 2, dt]]
-    assert np.allclose(F, np.kron([[1, dt, dt**2 / 2], [0, 1, dt], [0, 0, 1]], eye), rtol=1e-12, atol=1e-300)
-    assert np.allclose(Q, q * np.kron(one_axis, eye), rtol=1e-11, atol=1e-300)
 
 
 def test_every_type_without_edges_is_the_matrix_exponential(subtests):
@@ -219,50 +195,6 @@ def test_scaled_diffusion_is_scaled_noise(seed, dt):
 
 
 # laws of the shipped interactions
-
-
-def consensus_graph(rng, types, max_rate, heading=None):
-    nodes = node_table(rng, types)
-    return SceneGraph(nodes.id, nodes.types, tuple(interaction_edges(rng, nodes, SharedVelocity(), 0.5, max_rate)))
-
-
-@given(seeds, intervals, st.floats(0, 100))
-def test_a_consensus_stays_a_consensus(seed, dt, max_rate):
-    rng = np.random.default_rng(seed)
-    types = random_types(rng, 6, (CAR, BUS, TRAM))
-    graph = consensus_graph(rng, types, max_rate)
-    x, moved = [], []
-    for node_type in types:
-        position = rng.normal(size=2)
-        rest = np.zeros(node_type.dim - 4)
-        x.append(np.concatenate([position, [3.0, -2.0], rest]))
-        moved.append(np.concatenate([position + dt * np.array([3.0, -2.0]), [3.0, -2.0], rest]))
-    transition = discretise(graph, dt)
-    assert np.allclose(transition.F_matrix @ np.concatenate(x), np.concatenate(moved), rtol=1e-9, atol=1e-9)
-    assert not transition.b.any()
-
-
-@given(seeds, intervals, st.floats(0, 1e3))
-def test_no_interval_makes_shared_velocity_unstable(seed, dt, max_rate):
-    """Velocities are averaged with weights that are not negative and sum to one."""
-    rng = np.random.default_rng(seed)
-    graph = consensus_graph(rng, random_types(rng, 7, (CAR,)), max_rate)
-    F = discretise(graph, dt).F_matrix.toarray()
-    everything = in_order_of_components(graph, ("x", "y", "vx", "vy"), F)
-    n = 14
-    assert np.array_equal(everything[:n, :n], np.eye(n))
-    assert not everything[n:, :n].any()
-    velocities = everything[n:, n:]
-    assert velocities.min() > -1e-12
-    assert np.allclose(velocities.sum(axis=1), 1, atol=1e-9)
-    assert np.abs(np.linalg.eigvals(velocities)).max() <= 1 + 1e-9
-    rng = np.random.default_rng(seed)
-    graph = consensus_graph(rng, random_types(rng, 7, MOVING), max_rate)
-    F = discretise(graph, dt).F_matrix.toarray()
-    velocities = in_order_of_components(graph, ("vx", "vy"), F)
-    assert np.abs(velocities).sum(axis=1).max() <= 1 + 1e-9
-    accelerations = in_order_of_components(graph, ("ax", "ay"), F)
-    assert np.abs(np.linalg.eigvals(accelerations)).max(initial=0) <= 1 + 1e-9
 
 
 def queue(n, heading, rate, gap=15.0, **law):

@@ -28,6 +28,7 @@ detections = st.builds(
     yaw=maybe,
     velocity=st.tuples(maybe, maybe),
     score=st.floats(-10, 10),
+    range_rate=maybe,
 )
 
 
@@ -60,8 +61,9 @@ def test_an_empty_table_and_one_that_moves():
     assert len(Detections.empty()) == len(Detections.of([])) == 0
     assert list(Detections.empty()) == []
     assert len(Detections.empty().transformed(yaw_transform(1.0))) == 0
-    table = Detections.of([Detection("car", (1, 0, 0), score=-3.5)]).transformed(yaw_transform(10, 0, 0, np.pi))
-    assert table.score.tolist() == [-3.5]
+    told = Detection("car", (1, 0, 0), score=-3.5, range_rate=-3.0)
+    table = Detections.of([told]).transformed(yaw_transform(10, 0, 0, np.pi))
+    assert (table.score.tolist(), table.range_rate.tolist()) == ([-3.5], [-3.0])
     assert table.boxes.position[0] == pytest.approx([9, 0, 0])
 
 
@@ -90,6 +92,7 @@ def test_a_wrong_frame_is_refused(subtests):
         ({"timestamp": np.inf}, "timestamp: expected a finite number of seconds, got inf"),
         ({"timestamp": 1.7e18}, "timestamp: expected seconds, got 1.7e\\+18: milli-, micro- or nanoseconds?"),
         ({"timestamp": None}, "timestamp: expected a finite number of seconds, got None"),
+        ({"timestamp": 10**400}, "timestamp: expected a finite number of seconds"),
         ({"sensor": ""}, "sensor: expected a name, got ''"),
         ({"sensor": 7}, "sensor: expected a name, got 7"),
         ({"coordinates": "moon"}, "coordinates: expected one of world, ego, sensor, got 'moon'"),
