@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_tools.datasets.detection_files import PREDICTION_COLUMNS, PredictionRows, predictions_path, read_predictions
+from data_tools.datasets.detection_files import PREDICTION_COLUMNS, predictions_path, read_predictions
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.config import load_config
 from pipelines.explaining import journal_of, read_relations, read_track, story
@@ -236,16 +236,6 @@ def test_rows_are_the_predictions_in_centimetres_about_the_start(run):
     origin = run.scene.world_T_ego[0, :2, 3]
     np.testing.assert_allclose(at[:, 2:4] / 100, (predicted.position[1] - origin)[order], atol=0.006)
     np.testing.assert_allclose(at[:, 4] / 1e4, predicted.position_covariance[1, order, 0, 0], atol=1e-4)
-
-
-def test_predictions_of_ids_with_a_scene_belong_to_its_tracks(run):
-    from dataclasses import replace
-
-    report = scene_of_run({"saga": run}, (), CONFIG.sensors)
-    table = report.tracks["saga"]
-    named = replace(table, id=np.array([f"scene-0001-{id_}" for id_ in table.id]))
-    data = scene_data(replace(report, tracks={"saga": named}))["methods"]["saga"]
-    assert sum(map(len, data["predictions"])) == len(PredictionRows.from_moments(run.predictions))
 
 
 TRY = """

@@ -155,22 +155,10 @@ def test_help_lists_what_can_be_evaluated_and_those_that_come_along_are_sources(
     [
         (("evaluate", "file", "tracks.csv"), "error: evaluate file: expected ground truth, there is none"),
         (("track", "nothing"), "error: unknown dataset 'nothing'"),
-        (
-            ("evaluate", "mcap", "tracks.csv"),
-            "error: evaluate mcap: expected ground truth, there is none; name it: --truth TABLE",
-        ),
         (("track", "own.csv"), "error: own.csv: expected a dataset before the file: saga-fg track file own.csv ..."),
         (("view", "a bag"), "error: a bag: expected a dataset before the file: saga-fg view mcap 'a bag' ..."),
         (("smooth", "folder"), "error: folder: expected the name of a dataset before a folder: saga-fg smooth --help"),
         (("evaluate", "simulated", "tracks.csv", "--method", "kf"), "error: --method kf: goes without a result"),
-        (
-            ("learn", "interactions", "kitti", "--dataroot", "kitti", "-o", "out"),
-            "error: kitti: expected a folder with oxts/ and calib/",
-        ),
-        (
-            ("smooth", "benchmarks.recordings:EthUcySource", "--dataroot", ".", "-o", "out"),
-            "error: .: expected eth/obsmat.txt",
-        ),
     ],
 )
 def test_what_cannot_be_done_is_one_line(arguments, message, tmp_path, monkeypatch):

@@ -41,13 +41,12 @@ def test_overlaps_are_those_that_both_have(tmp_path):
         assert min(hota[overlap]["hota"] for overlap in overlaps) > 0.99
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_from_a_strangers_table_to_a_judged_result(tmp_path, monkeypatch, caplog, suffix):
+def test_from_a_strangers_table_to_a_judged_result(tmp_path, monkeypatch, caplog):
     monkeypatch.chdir(tmp_path)
     found, true = rows()
-    write(tmp_path / f"det{suffix}", found)
-    write(tmp_path / f"gt{suffix}", true)
-    look = saga_fg("inspect", f"det{suffix}")
+    write(tmp_path / "det.csv", found)
+    write(tmp_path / "gt.parquet", true)
+    look = saga_fg("inspect", "det.csv")
     assert look.exit_code == 0, look.output
     assert re.search(r"x +4\d\d\.\d+ .* from pos_x", look.stdout)
     assert "det, sensor: 40 frames in 3.9 s, 10 Hz" in look.stdout
@@ -55,7 +54,7 @@ def test_from_a_strangers_table_to_a_judged_result(tmp_path, monkeypatch, caplog
     lines = look.stdout.split("Next:\n")[1].splitlines()
     track, report = (line.strip() for line in lines)
     options = "--classes VEHICLE=car --units score=percent,angle=deg --sort"
-    assert track == f"saga-fg track file det{suffix} {options} --output tracks.csv"
+    assert track == f"saga-fg track file det.csv {options} --output tracks.csv"
     result = run_line(track)
     assert result.exit_code == 0, result.output
     assert not caplog.records
@@ -64,9 +63,8 @@ def test_from_a_strangers_table_to_a_judged_result(tmp_path, monkeypatch, caplog
     assert record is not None
     assert record.recordings["units"] == {"score": "percent", "angle": "deg"}
 
-    judged = saga_fg(
-        "evaluate", "file", "tracks.csv", "--truth", f"gt{suffix}", "--json", "f.json", "--markdown", "f.md"
-    )  # fmt: skip
+    judge = ("evaluate", "file", "tracks.csv", "--truth", "gt.parquet")
+    judged = saga_fg(*judge, "--json", "f.json", "--markdown", "f.md")
     assert judged.exit_code == 0, judged.output
     assert all(len(line) <= 80 for line in judged.stdout.splitlines())
     figures = json.loads((tmp_path / "f.json").read_text())
@@ -75,11 +73,10 @@ def test_from_a_strangers_table_to_a_judged_result(tmp_path, monkeypatch, caplog
     assert figures["errors"]["car"]["position"] < 0.2
     assert figures["errors"]["car"]["heading"] < 0.1  # degrees of both tables are rad
     assert "**Tracks beside the ground truth**" in (tmp_path / "f.md").read_text()
-    full = saga_fg("evaluate", "file", "tracks.csv", "--truth", f"gt{suffix}", "--full")
-    assert "Calibration" in full.stdout
+    assert "Calibration" in saga_fg(*judge, "--full").stdout
     assert "Calibration" not in judged.stdout
 
-    shown = run_line(f"{report} --truth gt{suffix}")
+    shown = run_line(f"{report} --truth gt.parquet")
     assert shown.exit_code == 0, shown.output
     assert (tmp_path / "report.html").stat().st_size > 20_000
 
@@ -155,7 +152,6 @@ def test_what_would_have_matched_is_told_where_nothing_does(tmp_path, caplog):
 def test_each_class_without_a_counterpart_is_told(tmp_path, caplog):
     for theirs, alone, classes in [
         ({"v0": "X"}, "tracks of X and true objects of BUS", "BUS=X"),
-        ({"v0": "coach", "v1": "VEHICLE"}, "tracks of coach and true objects of BUS", "BUS=coach"),
         ({"v0": "VEHICLE"}, "true objects of BUS", None),
         ({"v0": "coach", "v2": "Y"}, "tracks of Y, coach and true objects of BUS", "BUS=coach"),
     ]:
@@ -191,11 +187,6 @@ def test_decimal_commas_and_other_encodings_are_told_in_one_line(tmp_path):
     assert f"line 1 is in UTF-16; convert the file: iconv -f utf-16 -t utf-8 {table}" in tracked.stderr
 
 
-def test_without_truth_it_is_asked_for(tmp_path):
-    result = saga_fg("evaluate", "file", write(tmp_path / "t.csv", rows()[1]))
-    assert (result.exit_code, "name it: --truth TABLE" in result.stderr) == (2, True)
-
-
 def test_the_same_in_a_file_and_in_options(tmp_path):
     found, _ = rows()
     table = write(tmp_path / "d.csv", found)
@@ -216,21 +207,6 @@ def test_the_same_in_a_file_and_in_options(tmp_path):
 
 
 # What `inspect` and `track` say of tables with oddities, and what mends them
-
-
-def test_what_contradicts_how_it_is_read_is_refused_with_what_mends_it(tmp_path, caplog):
-    table = write(tmp_path / "d.csv", rows()[0])
-    mend = "--units score=percent,angle=deg"
-    refused = saga_fg("smooth", "file", table, "--sort", "--output", tmp_path / "labels")
-    assert refused.exit_code == 2
-    assert refused.stderr.rstrip().endswith(f"; add {mend}; --as-given reads it as it is"), refused.stderr
-    assert "headings look" in refused.stderr
-    assert "scores are not from 0 to 1" in refused.stderr
-    assert not (tmp_path / "labels").exists()
-    given = saga_fg("smooth", "file", table, "--sort", "--as-given", "--output", tmp_path / "labels")
-    assert given.exit_code == 0, given.output
-    told = [record.getMessage() for record in caplog.records]
-    assert len([line for line in told if "add --units" in line]) == 2, told
 
 
 def added(text: str) -> list[str]:
@@ -422,11 +398,7 @@ GOOD = {"timestamp": 0.0, "x": 1.0, "y": 2.0, "scene": "a", "vx": 0.5, "length":
 def test_a_look_refuses_what_track_refuses_and_both_name_file_and_row(tmp_path):
     for row, message in [
         ({"x": 2e9}, "line 5: x: expected a finite number within 1e+09, got 2e+09"),
-        ({"y": -1e300}, "line 5: y: expected a finite number within 1e+09, got -1e+300"),
-        ({"vx": 1e7}, "line 5: vx: expected a finite number within 1e+06, got 1e+07"),
-        ({"length": 1e6}, "line 5: length: expected a finite number within 100000, got 1e+06"),
         ({"length": 0}, "line 5: length: expected a positive number of metres, got 0"),
-        ({"ego_x": 1e12}, "line 5: ego_x: expected a finite number within 1e+09, got 1e+12"),
         ({"ego_yaw": 1.0}, "line 6: ego_x, ego_y, ego_z, ego_yaw: expected one pose at one time"),
         ({"scene": "n" * 300}, "line 5: scene: expected a name of at most 256 characters"),
     ]:

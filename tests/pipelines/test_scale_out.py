@@ -36,7 +36,7 @@ from pipelines.scale_out import (
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset
 from tests.pipelines.command import COMMAND, done, refused, saga_fg
-from tests.pipelines.scale_out_example import CONFIG, TRACK, Broken, Deadly, InThisProcess, content, write_recordings
+from tests.pipelines.scale_out_example import TRACK, Broken, Deadly, InThisProcess, content, write_recordings
 
 
 def run(inputs: list[Part], output: Path, task: SceneTask = TRACK, workers: int = 0) -> RunSummary:
@@ -78,14 +78,6 @@ def test_what_has_changed_is_done_again_and_nothing_else(tmp_path):
     assert report.done == ["a00", "a01", "a02", "a03"]
     after = content(output)
     assert {name for name in after if after[name] != expected[name]} == {"a03.csv"}
-
-
-def test_other_settings_or_another_method_do_everything_again(tmp_path):
-    inputs, output = write_recordings(tmp_path / "in", 2), tmp_path / "out"
-    run(inputs, output)
-    other = replace(CONFIG, tracker=replace(CONFIG.tracker, report_coasting=0.0))
-    for task in (replace(TRACK, settings=other), replace(TRACK, method="kf"), TRACK):
-        assert run(inputs, output, task).done == ["a00", "a01"]
 
 
 def test_the_manifest_says_how_a_result_came_about(tmp_path):
@@ -141,18 +133,6 @@ def test_a_scene_that_kills_every_worker_fails_alone(tmp_path):
     assert report.failed == {"a01": "the worker process ended 2 times (signal 9, Killed)"}
 
 
-def test_simulated_scenes_are_made_at_the_worker(tmp_path):
-    settings = SimulatorSettings(duration=1.0, warm_up=2.0)
-    source = SimulatedSource(simulator=settings, scenes=2, seed=7)
-    with source.parts() as parts:
-        inputs = list(parts.parts)
-    run(inputs, tmp_path / "parallel", workers=2)
-    run(inputs, tmp_path / "serial")
-    assert content(tmp_path / "parallel") == content(tmp_path / "serial")
-    (first, second) = content(tmp_path / "serial").values()
-    assert first != second
-
-
 def test_a_held_scene_is_known_by_all_it_holds():
     settings = SimulatorSettings(duration=1.0, warm_up=2.0)
     with opened_scene(SimulatedSource(simulator=settings, scenes=1, seed=7), "scene-0001") as at:
@@ -204,23 +184,6 @@ def test_one_process_of_a_node_compiles_kernels_while_the_others_wait(monkeypatc
     monkeypatch.setattr(pools, "load_kernels", lambda: happened.append("alone"))
     pools.perform_on_node("third")  # type: ignore[arg-type]
     assert happened[-2:] == ["alone", "third"]
-
-
-def test_kernels_are_loaded_before_workers_begin(monkeypatch):
-    """Else each of them compiles them, and says so."""
-    happened: list[str] = []
-
-    class Worker:
-        def __init__(self, scratch: Path | None) -> None:
-            happened.append("worker")
-
-        def end(self) -> None:
-            pass
-
-    monkeypatch.setattr(pools, "_Worker", Worker)
-    monkeypatch.setattr(pools, "load_kernels", lambda: happened.append("kernels"))
-    assert list(LocalPool(2).outcomes(iter(()), 2)) == []
-    assert happened == ["kernels", "worker", "worker"]
 
 
 # `saga-fg track ... --workers N`, killed in the middle and run again; and on a Ray cluster of two workers
@@ -416,16 +379,3 @@ def test_labels_are_those_of_one_process(simulated, tmp_path):
     parts = [path.read_text().splitlines() for path in sorted((tmp_path / "run" / "labels").iterdir())]
     assert [part[0] for part in parts] == [header] * 3
     assert [row for part in parts for row in part[1:]] == rows
-
-
-def test_kitti_sequences_in_parallel(recordings, tmp_path):
-    kitti = recordings / "kitti"
-    track = [
-        *("track", "kitti", "--dataroot", kitti, "--detections", kitti / "detections" / "pointrcnn"),
-        *("--scenes", "0000,0017", "--method", "centerpoint"),
-    ]
-    assert saga_fg(*track, "-o", tmp_path / "serial").exit_code == 0
-    assert saga_fg(*track, "-o", tmp_path / "run", "--workers", "2").exit_code == 0
-    for name in ("0000.txt", "0017.txt", "tracks.csv"):
-        assert (tmp_path / "run" / "tracks" / name).read_bytes() == (tmp_path / "serial" / name).read_bytes()
-    assert "0 done, 2 unchanged" in saga_fg(*track, "-o", tmp_path / "run", "--workers", "1").stdout

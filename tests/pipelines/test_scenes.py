@@ -123,24 +123,6 @@ class TwoScenes:
         return scene([0.0], [0.0], name)
 
 
-@pytest.mark.parametrize("method", ["saga", "kf", "centerpoint"])
-def test_every_method_tracks_a_car_through_a_scene(method):
-    """10 m/s along x, seen ten times a second by one sensor, tracks wanted in between and afterwards."""
-    steps = np.arange(20) / 10
-    frames = [
-        Frame(t, "lidar", Detections(Boxes.of(["car"], [[10 * t, 0, 1]], [[4, 2, 1.5]], [0.0]), np.array([0.9])))
-        for t in steps
-    ]
-    moments = np.append(steps[10:], [1.95, 2.0])
-    whole = Scene("a", moments, np.tile(np.eye(4), (12, 1, 1)), ("",) * 12, frames)
-    run = track_scene(whole, TrackConfig().new_tracker(method))  # type: ignore[arg-type]
-    assert [len(tracks) for tracks in run.tracks] == [1] * 12
-    assert len({int(tracks.id[0]) for tracks in run.tracks}) == 1
-    position = np.array([tracks.boxes.position[0, 0] for tracks in run.tracks])
-    np.testing.assert_allclose(position, 10 * moments, atol=0.3)
-    np.testing.assert_allclose(run.tracks[-1].boxes.velocity, [[10.0, 0.0]], atol=0.5)
-
-
 def test_kf_is_the_tracker_without_edges():
     config = TrackConfig()
     assert config.new_tracker("saga").settings.edges  # type: ignore[attr-defined]

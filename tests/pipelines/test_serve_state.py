@@ -82,16 +82,6 @@ def test_frames_that_were_held_are_sent_again(tmp_path):
         assert status(address)["taken"] == {"sensor": 12}
 
 
-def test_the_state_of_another_configuration_is_refused_and_stays(tmp_path):
-    state = tmp_path / "state"
-    run("serve", "--snapshot", state, given=frame(0))
-    whole = state.read_bytes()
-    said = refused("serve", "--snapshot", state, "--estimator", "isam2")
-    assert "'estimator: kalman' instead of 'estimator: isam2'" in said
-    assert len(said.splitlines()) == 1
-    assert state.read_bytes() == whole
-
-
 def test_factors_of_ones_own_cannot_be_kept(tmp_path, monkeypatch):
     config = tmp_path / "own.yaml"
     config.write_text("tracker: {estimator: isam2, providers: ['walls:Wall']}\n")
@@ -172,23 +162,6 @@ def test_another_configuration_is_refused_with_what_differs(tmp_path):
         read_state(path, {**HEADER, "version": "2"})
     with pytest.raises(InputError, match="no regular file"):
         read_state(tmp_path, HEADER)
-
-
-def test_a_stream_goes_on_as_if_nothing_had_happened(tmp_path):
-    whole = file_sent(stream(), *range(20))
-    first = stream()
-    keeper = kept(first, tmp_path / "state.saga")
-    assert [a["durable_seq"] for a in file_sent(first, *range(8))] == [-1] * 8
-    assert keeper.save()
-    assert file_sent(first, 8, 9)[-1]["durable_seq"] == 7
-    keeper.release()  # and is killed
-    second = stream()
-    kept(second, tmp_path / "state.saga")
-    assert (second.status()["last_seq"], second.status()["frames"]) == ({"sensor": 7}, 8)
-    rest = file_sent(second, *range(7, 20))
-    assert rest[0]["type"] == "repeat"
-    assert [a["tracks"] for a in rest[1:]] == [a["tracks"] for a in whole[8:]]
-    assert (second.status()["frames"], second.status()["taken"]) == (20, {"sensor": 20})
 
 
 def test_a_reset_is_on_the_disk_before_it_is_answered(tmp_path):

@@ -82,27 +82,6 @@ def test_an_output_that_cannot_be_written_is_found_before_the_work(tmp_path):
     assert "does not exist" in refused("smooth", "simulated", "-o", tmp_path / "missing" / "labels")
 
 
-def test_labels_are_judged_beside_online_tracks_and_detections(tmp_path):
-    done(
-        "smooth",
-        "simulated",
-        "--scenes",
-        "1",
-        "--seed",
-        "9",
-        "-o",
-        tmp_path / "labels",
-        "--simulator",
-        _short(tmp_path),
-        "--method",
-        "kf",
-    )
-    arguments = ["evaluate", "labels", "simulated", str(tmp_path / "labels"), "--seed", "9"]
-    run = done(*arguments, "--simulator", _short(tmp_path), "--method", "kf")
-    for title in ("online: Tracks at every moment", "labels: RMSE at labels", "labels: Calibration"):
-        assert title in run.output
-
-
 def test_labels_of_a_table_are_judged_by_a_table_of_truth(tmp_path):
     table, truth, figures = (tmp_path / name for name in ("detections.csv", "truth.csv", "figures.json"))
     boxes = [f"{0.1 * k:.1f},{k}.0,0.0,4.5,1.9,1.6,0.0,car" for k in range(15)]
@@ -116,12 +95,6 @@ def test_labels_of_a_table_are_judged_by_a_table_of_truth(tmp_path):
     assert json.loads(figures.read_text())["labels"]["tracking"]["overall"]["recall"] == 1.0
     labels[3] = tmp_path / "nothing"
     assert "expected a folder that `saga-fg smooth` wrote" in refused(*labels, "--truth", truth)
-
-
-def _short(folder: Path) -> Path:
-    path = folder / "simulator.yaml"
-    path.write_text("duration: 2.0\nwarm_up: 5.0\n")
-    return path
 
 
 # Smoothing a simulated recording from end to end

@@ -126,11 +126,6 @@ def test_a_page_shows_tracks_beside_detections_and_truth(tracks, tmp_path):
     assert repr(page).startswith(f"1 scene, {len(tracks)} boxes: a page of")
 
 
-def test_labels_say_how_many_they_are():
-    labels = saga_fg.smooth(DETECTIONS)
-    assert repr(labels).startswith("labels of 1 scenes, 90 boxes")
-
-
 def test_labels_of_boxes_seen_from_above_keep_their_sizes():
     found = saga_fg.smooth(DETECTIONS.assign(length=4.5, width=1.8)).boxes()
     assert found["length"].to_numpy() == pytest.approx(4.5)

@@ -1,6 +1,5 @@
 """`saga-fg track`: results, settings, options, doubts, files by their address."""
 
-import csv
 import json
 import re
 from collections.abc import Callable, Iterator
@@ -78,11 +77,6 @@ def test_mistakes_end_in_one_line_and_no_file(simulated, tmp_path):
         ((), "expected either --split NAME or --scenes A,B"),
         (("--split", "all", "--scenes", "scene-0001"), "expected either --split NAME or --scenes A,B"),
         (("--split", "everything"), "unknown split 'everything'"),
-        (("--scenes", "scene-0009"), "unknown scene 'scene-0009'"),
-        (("--split", "all", "--detections", "b.json"), "--detections b.json: expected NAME=FILE"),
-        (("--split", "all", "--detections", "camera=none.json"), "none.json"),
-        (("--split", "all", "--version", "v1.0-none"), "v1.0-none"),
-        (("--split", "all", "--config", "none.yaml"), "none.yaml: cannot be read"),
     ]:
         said = refused(*arguments(simulated, tmp_path / "tracks.json"), *extra)
         assert message in said
@@ -108,32 +102,6 @@ def test_a_scene_that_breaks_on_the_way_leaves_the_earlier_result(simulated, tmp
     assert list(tmp_path.iterdir()) == [output]
 
 
-def test_tables_of_ones_own(tmp_path):
-    for method in METHODS:
-        table = tmp_path / "detections.csv"
-        rows = [f"{k / 10},car,{k * 0.5},2.0,0.9" for k in range(10)]
-        table.write_text("\n".join(["timestamp,label,x,y,score", *rows]) + "\n")
-        output = tmp_path / "tracks.csv"
-        result = done("track", "file", table, "--output", output, "--method", method)
-        late = int(method != "centerpoint")  # the others report from the second detection on
-        text = f"{output}: 1 scene, 10 frames, 1 track (1 with a score above 0.5), {10 - late} boxes, "
-        assert result.stdout.startswith(text)
-        with output.open() as file:
-            read = list(csv.DictReader(file))
-        assert [float(row["timestamp"]) for row in read] == [k / 10 for k in range(late, 10)]
-        assert {row["id"] for row in read} == {"1"}
-
-
-def test_nuscenes_recordings(recordings, tmp_path):
-    nuscenes = recordings / "nuscenes"
-    result = done("track", "nuscenes", "--dataroot", nuscenes, "--version", "v1.0-mini", "--scenes", "scene-0103",
-        "--detections", f"lidar={nuscenes / 'detections' / 'centerpoint_lidar.json'}",
-        "--detections", f"camera={nuscenes / 'detections' / 'fastbev_camera.json'}",
-        "--output", tmp_path / "tracks.json",)  # fmt: skip
-    assert "1 scene, 80 frames" in result.stdout
-    assert len(read_tracking_results(tmp_path / "tracks.json").samples) == 40
-
-
 # The shipped configuration: every kind of data has one, each is valid, and users' files lie over it
 
 
@@ -141,35 +109,6 @@ def test_shipped_defaults_are_valid_and_survive_the_round_trip():
     for family in get_args(Family):
         config = load_config(family)
         assert read_settings(TrackConfig, write_settings(config)) == config
-
-
-def test_a_users_file_lies_over_the_shipped_defaults(tmp_path):
-    path = tmp_path / "mine.yaml"
-    path.write_text("tracker: {max_delay: 0.25}\nsensors: {radar: {time_offset: -0.05}}\n")
-    config = load_config("kitti", path)
-    assert config.tracker.max_delay == 0.25
-    assert config.sensors["radar"].time_offset == -0.05
-    assert config.sensors["radar"].score == load_config("kitti").sensors["default"].score
-    assert config.greedy == load_config("kitti").greedy
-
-
-def test_a_mistake_in_a_users_file_names_file_and_key(tmp_path):
-    path = tmp_path / "mine.yaml"
-    for text, message in [
-        (
-            "tracker: {existence: {delete_belw: 0.3}}",
-            "tracker.existence.delete_belw: unknown key, did you mean 'delete_below'?",
-        ),
-        ("sensors: {lidar: {extrinsics: {x: .nan}}}", "sensors.lidar.extrinsics: x: expected a finite number, got nan"),
-        (
-            "sensors: {lidar: {extrinsics: {yaw: .inf}}}",
-            "sensors.lidar.extrinsics: yaw: expected a finite number, got inf",
-        ),
-    ]:
-        path.write_text(text)
-        with pytest.raises(InputError) as caught:
-            load_config("nuscenes", path)
-        assert str(caught.value) == f"{path}: {message}"
 
 
 def test_every_setting_explains_itself():

@@ -19,7 +19,7 @@ from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.report import ReportScene, scene_of_run
 from pipelines.tracking import track_scene
-from pipelines.view import Drawing, SceneView, draw_scene, in_order, read_slam_view, write_view
+from pipelines.view import SceneView, draw_scene, read_slam_view, write_view
 from pipelines.view.scenes import HELD, ellipses
 from saga_fg import InputError
 from saga_fg.numerics.arrays import FloatArray
@@ -390,28 +390,6 @@ def test_both_kinds_of_file_show_the_same(tmp_path, shown):
             np.testing.assert_allclose(np.reshape(found[entity][time], (-1, 3)), there, atol=2e-3, err_msg=entity)
 
 
-def test_scans_are_clouds_in_the_frame_of_their_sensor(tmp_path, shown):
-    start = float(shown.scene.timestamps[0])
-    scans = TwoScans(np.array([start - 0.1, start + 0.6]))
-    write_view(tmp_path / "a.mcap", "a", ["scene-0001"], draw_scene(SceneView(shown, scans)))
-    topics = read_mcap(tmp_path / "a.mcap")
-    first, second = topics[f"{ROOT}/ego/lidar/points"]
-    assert (first.time, second.time) == (0, 700_000_000)  # of what is earliest
-    assert topics[f"{ROOT}/saga/boxes"][0].time == 100_000_000
-    points = np.frombuffer(second.content.data, "<f4").reshape(-1, 3)
-    np.testing.assert_allclose(points, [[1, 2, 3], [4, 5, 7]])  # thinned
-    assert second.content.point_stride == 12
-    assert [(each.name, each.offset, each.type) for each in second.content.fields] == [
-        ("x", 0, 7),
-        ("y", 4, 7),
-        ("z", 8, 7),
-    ]
-    (pose,) = topics[f"{ROOT}/ego/lidar"][0].content.transforms
-    assert pose.child_frame_id == first.content.frame_id == "scene-0001/ego/lidar"
-    np.testing.assert_allclose(xyz(pose.translation), [1, 0, 2])
-    np.testing.assert_allclose([*xyz(pose.rotation), pose.rotation.w], [0, 0, np.sin(0.25), np.cos(0.25)])
-
-
 def test_the_command_writes_the_file_that_the_suffix_names(tmp_path):
     pytest.importorskip("mcap_protobuf", reason="mcap is not installed (extra [mcap])")
     slam = tmp_path / "slam"
@@ -439,11 +417,3 @@ def test_a_drawing_that_fails_leaves_no_file(tmp_path, shown):
     with pytest.raises(InputError, match="scan 7"):
         write_view(tmp_path / "a.mcap", "a", ["scene-0001"], broken())
     assert not list(tmp_path.iterdir())
-
-
-def test_several_scenes_are_drawn_in_order_of_time(shown):
-    times = [each.time for each in in_order(draw_scene(SceneView(shown)), draw_scene(SceneView(shown)))]
-    always = times.count(None)
-    assert times[:always] == [None] * always
-    assert times[always:] == sorted(times[always:])  # type: ignore[type-var]
-    assert Drawing("a", "b", next(draw_scene(SceneView(shown))).shape).path == "a/b"

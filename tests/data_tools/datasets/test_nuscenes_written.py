@@ -17,7 +17,6 @@ from data_tools.datasets.nuscenes import (
     write_tracking_results,
 )
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings, lidar
-from data_tools.simulator.settings import TrafficSettings
 from saga_fg import Boxes, Scene, Tracks
 from saga_fg.errors import InputError
 
@@ -157,16 +156,6 @@ def test_writing_is_all_or_nothing(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
     read = NuScenes(tmp_path / "out", "v1.0-mini", {"x": tmp_path / "out" / "detections" / "front lidar.json"})
     assert len(read.scene("scene-0001")) == 2  # without a sensor named lidar the poses are there all the same
-
-
-def test_classes_beyond_vehicles_and_pedestrians_have_their_categories(tmp_path):
-    traffic = TrafficSettings(truck_share=0.7, bus_share=0.0, trailer_share=1.0)
-    settings = SimulatorSettings(duration=2.0, warm_up=5.0, traffic=traffic)
-    write(tmp_path / "out", SimulatedTraffic(settings, scenes=1))
-    folder = tmp_path / "out" / "v1.0-mini"
-    categories = {record["token"]: record["name"] for record in json.loads((folder / "category.json").read_text())}
-    instances = json.loads((folder / "instance.json").read_text())
-    assert "vehicle.trailer" in {categories[record["category_token"]] for record in instances}
 
 
 META = ResultMeta(use_lidar=True)

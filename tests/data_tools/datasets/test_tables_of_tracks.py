@@ -8,7 +8,6 @@ import pytest
 
 from benchmarks.recordings.crowds import EthUcySource
 from data_tools.datasets.detection_files import (
-    LABEL_COLUMNS,
     read_detections,
     read_tracks,
     write_label_table,
@@ -174,15 +173,6 @@ def test_a_table_of_labels_comes_back_as_it_was(tmp_path, suffix):
     assert np.array_equal(rows.position_covariance[0], LABELS[0].tracks.position_covariance[0])
 
 
-def test_parquet_holds_the_same_columns(tmp_path):
-    parquet = pytest.importorskip("pyarrow.parquet", reason="Parquet comes with the extra parquet")
-    write_label_table(tmp_path / "labels.parquet", [(scene_of([0.0, 0.5, 1.0]), LABELS)])
-    table = parquet.read_table(tmp_path / "labels.parquet")
-    assert tuple(table.column_names) == LABEL_COLUMNS
-    assert table.column("id").to_pylist() == [1, 2, 1, 1, 3]
-    assert table.column("yaw_variance").to_pylist() == [None] * 5
-
-
 def test_labels_of_another_length_are_refused(tmp_path):
     with pytest.raises(InputError, match="expected tracks for 2 moments, got 3"):
         write_label_table(tmp_path / "labels.csv", [(scene_of([0.0, 0.5]), LABELS)])
@@ -288,22 +278,6 @@ def test_detections_come_from_a_table_where_one_is_given(recordings):
         assert len(scene.ground_truth) == 5
     with EthUcySource(dataroot=str(recordings)).open() as dataset:
         assert dataset.scene("hotel").sensors == ("annotations",)
-
-
-def test_recordings_are_chosen_by_name(recordings):
-    with EthUcySource(dataroot=str(recordings), scenes="hotel").open() as dataset:
-        assert dataset.scenes == ("hotel",)
-    with (
-        pytest.raises(InputError, match="--scenes: unknown scene 'hotels'; did you mean 'hotel'"),
-        EthUcySource(dataroot=str(recordings), scenes="hotels").open(),
-    ):
-        pass
-
-
-def test_the_folder_may_be_a_url(recordings):
-    pytest.importorskip("fsspec", reason="files by URL come with the extra remote")
-    with EthUcySource(dataroot=f"file://{recordings}").open() as dataset:
-        assert len(dataset.scene("hotel").frames) == 5
 
 
 def test_a_result_of_some_recordings_is_scored_on_these(recordings, caplog):

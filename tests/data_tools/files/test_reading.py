@@ -179,7 +179,7 @@ def test_what_is_whole_is_read(valid):
     assert read["configuration"].tracker.max_delay == 0.5
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_damage_is_read_or_named(valid, seed):
     for number, (name, target) in enumerate(valid.items()):
         rng = random.Random(1000 * seed + number)

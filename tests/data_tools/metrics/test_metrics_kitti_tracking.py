@@ -116,28 +116,6 @@ def test_boxes_that_need_not_match():
     assert f.fp == 1  # the last one lies in the region for less than half
 
 
-def test_neighbours_by_class():
-    truth = [(f, 0, 0.0, {"type": "Pedestrian"}) for f in range(25)] + [
-        (f, 1, 9.0, {"type": "Person_sitting"}) for f in range(25)
-    ]
-    f = figures(
-        truth,
-        [(f, n, 9.0 * n, {"type": "Pedestrian", "score": 1.0}) for f in range(25) for n in range(2)],
-        "pedestrian",
-    )
-    assert (f.gt, f.fn, f.fp) == (25, 0, 0)
-    assert figures(truth, [], "Cyclist") is None
-
-
-def test_the_usual_evaluation_leaves_out_labels_of_persons():
-    truth = [(f, 0, 0.0, {"type": "Pedestrian"}) for f in range(25)] + [
-        (f, 1, 9.0, {"type": "Person"}) for f in range(25)
-    ]
-    found = [(f, n, 9.0 * n, {"type": "Pedestrian", "score": 1.0}) for f in range(25) for n in range(2)]
-    f = figures(truth, found, "pedestrian")
-    assert (f.gt, f.tp, f.fn, f.fp) == (25, 25, 0, 25)
-
-
 def test_rounding_costs_points_only_in_the_official_value():
     # The mean of 25 times 0.9 falls a bit short of 0.9, the mean of these means again: at every threshold all are gone.
     for score, official in ((0.5, 1.0), (0.9, 0.0)):

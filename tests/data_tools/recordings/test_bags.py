@@ -58,8 +58,7 @@ def written(folder: Path, form: str, messages: list[tuple]) -> Path:
     return example.write_bag(folder / "bag", messages, "mcap" if form == "bag of mcap" else "sqlite3")
 
 
-@pytest.mark.parametrize("form", ["mcap", "bag", "bag of mcap"])
-@pytest.mark.parametrize("absolute", [False, True])
+@pytest.mark.parametrize(("form", "absolute"), [("mcap", False), ("bag", True), ("bag of mcap", False)])
 def test_scans_are_those_that_were_written(tmp_path: Path, scans: list[Scan], form: str, absolute: bool) -> None:
     messages = scan_messages(scans, TIMES, MOUNT, absolute=absolute, big_endian=absolute)
     found = open_recording(written(tmp_path, form, messages))

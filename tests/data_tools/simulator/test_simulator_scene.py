@@ -43,9 +43,9 @@ def overlapping(boxes: Boxes) -> list[tuple[int, int]]:
     return list(zip(first[bad].tolist(), second[bad].tolist(), strict=True))
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_no_vehicle_touches_another_or_what_stands_beside_the_road(seed):
-    here = world(seed) if seed < 3 else build_world(MERGES, seed)
+    here = world(seed) if seed < 2 else build_world(MERGES, seed)
     vehicles = here.objects.select(np.flatnonzero(here.objects.label != "pedestrian"))
     occluders = here.occluders
     for time in vehicles.time[:-1:10]:
