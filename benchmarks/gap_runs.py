@@ -23,6 +23,8 @@ Situations of hidden objects, decided by the labels alone, until each length of 
                        is slower than `SLOW` meanwhile
     going              a vehicle that comes there first and in the gap; the other one comes within `AFTER` s
     merging            both come there within `AFTER` s, the first of them in the gap, and go on in one direction
+    for people         a vehicle that waits so for a person
+    people crossing    a person whose way meets that of a vehicle within `AFTER` s, the first of them in the gap
 
 The route is where the labels say that the object goes after the start, and straight on from the last of them.
 """
@@ -30,7 +32,7 @@ The route is where the labels say that the object goes after the start, and stra
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
 from typing import Literal, NamedTuple, Protocol
@@ -38,13 +40,13 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 
 from data_tools.metrics import nees
-from pipelines.learning.interactions import CAP, Contender, Errors, JudgedRun, classes_of, tracks_without
+from pipelines.learning.interactions import CAP, DETECTED, Contender, Errors, JudgedRun, classes_of, tracks_without
 from pipelines.tracking import Progress
 from saga_fg.learning.interaction_fit import ROAD_USERS
 from saga_fg.learning.labelled_scene import LENGTHS, LONGEST, MOVING, Gap, LabelledScene, is_moving, made_gaps, reached
 from saga_fg.model import Sensor
 from saga_fg.numerics import FloatArray, feet, wrap_angle
-from saga_fg.types import Boxes, Lane, LanesAcross, RoadMap, Scene, StopLine
+from saga_fg.types import Boxes, Lane, LanesAcross, RoadMap, Scene, StopLine, Tracks
 
 STEP = 0.5  # m between points: shorter ones are noise
 ONWARD = 80.0  # m beyond the last label
@@ -68,8 +70,9 @@ def route_of(labelled: LabelledScene, row: int, start: int) -> FloatArray | None
 
 SITUATIONS = (
     *("all", "moving", "stationary", "visible leader", "free", "halting", "starting", "turning", "at red"),
-    *("waiting", "going", "merging"),
+    *("waiting", "going", "merging", "for people", "people crossing"),
 )
+PEOPLE = ("pedestrian",)
 UNDER_WAY = 1.0  # m/s; an object stands below `MOVING`
 LEADER_REACH, PATH_HALF_WIDTH = 50.0, 1.6  # m
 SEEN_SHARE = 0.8  # of the moments of the gap at which a visible leader has a detection
@@ -91,7 +94,7 @@ def situations_of(labelled: LabelledScene, gap: Gap) -> Mapping[float, frozenset
     speed = np.hypot(*labelled.velocity[:, row].T)
     always = {"all", "moving" if gap.moving else "stationary"}
     leader: int | None = None
-    met = meetings(labelled, row, start) if labelled.label[row] in ROAD_USERS else []
+    met = meetings(labelled, row, start) if labelled.label[row] in (*ROAD_USERS, *PEOPLE) else []
     if labelled.label[row] in ROAD_USERS and (route := route_of(labelled, row, start)) is not None:
         leader = leader_on(labelled, row, start, route)
         if leader is None:
@@ -118,20 +121,23 @@ def situations_of(labelled: LabelledScene, gap: Gap) -> Mapping[float, frozenset
 
 
 class Meeting(NamedTuple):
-    """When an object and another one first come to where their ways meet, s after the start of a gap, and whether they
-    go on alike from there."""
+    """When an object and another one first come to where their ways meet, s after the start of a gap; whether they go
+    on alike from there, and which of them are people."""
 
     own: float
     other: float
     alike: bool
+    walks: tuple[bool, bool]
 
     def situations(self, until: float, slow: bool) -> Iterator[str]:
         """The situations of the object until then, which was `slow` meanwhile or not."""
         if min(self.own, self.other) > until:
             return
-        if self.other < self.own and slow:
-            yield "waiting"
-        if abs(self.own - self.other) <= AFTER:
+        if self.other < self.own and slow and not self.walks[0]:
+            yield "for people" if self.walks[1] else "waiting"
+        if abs(self.own - self.other) <= AFTER and any(self.walks):
+            yield from ["people crossing"][not self.walks[0] :]
+        elif abs(self.own - self.other) <= AFTER:
             if self.own <= self.other:
                 yield "going"
             if self.alike:
@@ -142,7 +148,9 @@ def meetings(labelled: LabelledScene, row: int, start: int) -> list[Meeting]:
     """Where the labelled way of an object from a moment on meets those of others, neither of which is there yet."""
     time = labelled.scene.timestamps[start:] - labelled.scene.timestamps[start]
     way = labelled.position[start : start + np.searchsorted(time, HORIZON)]
-    others, found = np.isin(labelled.label, ROAD_USERS) & np.isfinite(way[0, :, 0]), []
+    walks = np.isin(labelled.label, PEOPLE)
+    met = np.isin(labelled.label, ROAD_USERS) | (walks & ~walks[row])
+    others, found = met & np.isfinite(way[0, :, 0]), []
     others[row] = False
     for other in np.flatnonzero(others).tolist():
         apart = np.linalg.norm(way[:, row, None] - way[:, other], axis=-1)
@@ -151,7 +159,8 @@ def meetings(labelled: LabelledScene, row: int, start: int) -> list[Meeting]:
             own = int(near.any(axis=1).argmax())
             at = int(near[own].argmax())
             turned = labelled.yaw[start + own, row] - labelled.yaw[start + at, other]
-            found.append(Meeting(float(time[own]), float(time[at]), bool(np.cos(turned) > ALIKE)))
+            both = bool(walks[row]), bool(walks[other])
+            found.append(Meeting(float(time[own]), float(time[at]), bool(np.cos(turned) > ALIKE), both))
     return found
 
 
@@ -305,6 +314,81 @@ class ExtrapolatedRun(JudgedRun):
         return None
 
 
+CURVE = "curve"
+"""Contender: the tracks of `kf`, hidden ones by `CurveRun`."""
+FITTED, FADING, LATERAL = 1.0, 4.0, 4.0  # s; s; m/s^2
+
+
+class CurveRun(JudgedRun):
+    """A run whose tracks go on in a curve while they are hidden, independent of the engine.
+
+    By a line through the velocities v that were reported in the last `FITTED` s in view, each track has an acceleration
+    a along its course and a curvature k, which lasts. The acceleration fades (Singer, IEEE Trans. AES 6, 1970):
+
+        dv/dt = a exp(-t / FADING),  v >= 0,      d course / ds = k
+
+    Covariances stay those of the tracker.
+    """
+
+    def __init__(self, labelled: LabelledScene, tracks: Sequence[Tracks]) -> None:
+        past: dict[int, list[tuple[float, FloatArray, FloatArray]]] = {}
+        curved = []
+        for found in tracks:
+            position = found.boxes.position.copy()
+            for row, node in enumerate(found.id.tolist()):
+                own, hidden = past.setdefault(node, []), found.coasting[row] > DETECTED
+                if not hidden:
+                    own.append((found.timestamp, position[row, :2].copy(), found.boxes.velocity[row]))
+                elif own:
+                    position[row, :2] = self._onward(own, found.timestamp)
+            curved.append(replace(found, boxes=replace(found.boxes, position=position)))
+        super().__init__(labelled, curved)
+
+    @staticmethod
+    def _onward(own: list[tuple[float, FloatArray, FloatArray]], until: float) -> FloatArray:
+        """The place (2,) at a time, by times, places and velocities in view."""
+        time, place, velocity = own[-1]
+        near = [one for one in own if one[0] >= time - FITTED]
+        v = float(np.hypot(*velocity))
+        ahead = velocity / max(v, 1e-6)
+        at, known = np.array([one[0] for one in near]) - time, np.array([one[2] for one in near])
+        spread = ((at - at.mean()) ** 2).sum()
+        pull = (at - at.mean()) @ known / spread if spread > 0 else np.zeros(2)
+        a, across = float(pull @ ahead), float(np.clip(pull @ [-ahead[1], ahead[0]], -LATERAL, LATERAL))
+        curvature = across / v**2 if v > UNDER_WAY else 0.0
+        t = np.linspace(0.0, until - time, max(2, round(10 * (until - time)) + 1))
+        speed = np.maximum(v + a * FADING * (1 - np.exp(-t / FADING)), 0.0)
+        speed[np.minimum.accumulate(speed) == 0] = 0.0
+        step = (speed[1:] + speed[:-1]) / 2 * np.diff(t)
+        course = np.arctan2(velocity[1], velocity[0]) + curvature * (np.cumsum(step) - step / 2)
+        return np.asarray(place + (step[:, None] * np.column_stack([np.cos(course), np.sin(course)])).sum(axis=0))
+
+
+HINDSIGHT = "edges by hindsight"
+"""Contender: of `saga` and `trails alone` the one with the lower error in each gap, the limit of choosing edges."""
+
+
+def by_hindsight(runs: Sequence[LivedRun]) -> list[LivedRun]:
+    """Runs of `HINDSIGHT` where there are both."""
+    alone = {(run.recording, run.life): run for run in runs if run.contender == "trails alone"}
+    pairs = [
+        (run, alone[key]) for run in runs if run.contender == "saga" and (key := (run.recording, run.life)) in alone
+    ]
+    return [
+        replace(mine, contender=HINDSIGHT, outcomes=tuple(map(_better, mine.outcomes, other.outcomes)))
+        for mine, other in pairs
+    ]
+
+
+def _better(one: Judgement, other: Judgement) -> Judgement:
+    """The lower error of two, at the end of each length and over the gap."""
+    whole, other = (other, one) if other.error < one.error else (one, other)
+    at, predicted = dict(other.at), dict(other.predicted)
+    at |= {h: error for h, error in whole.at.items() if error <= at.get(h, np.inf)}
+    mine = {h: found for h, found in whole.predicted.items() if h not in predicted or found.error < predicted[h].error}
+    return replace(whole, at=at, predicted=predicted | mine)
+
+
 def judgement(run: JudgedRun, gap: Gap) -> Judgement:
     """Judge one gap."""
     holder, at = run.holder(gap), run.outcome(gap)
@@ -441,4 +525,5 @@ def judged_run(labelled: LabelledScene, gaps: Sequence[Gap], contender: Contende
     """Track without the detections of the made ones among the gaps of one run."""
     made, lived = [gap for gap in gaps if gap.run > 0], contender.kept_alive() if life == "kept" else contender
     kind = ExtrapolatedRun if contender.method == "centerpoint" else JudgedRun
+    kind = CurveRun if contender.name == CURVE else kind
     return kind(labelled, tracks_without(labelled, made, lived))

@@ -30,6 +30,7 @@ import numpy as np
 import typer
 
 from benchmarks.crossings import simulated_crossings
+from benchmarks.recordings.argoverse2 import argoverse_logs
 from benchmarks.recordings.crowds import RATE, recorded_crowds, simulated_crowds
 from benchmarks.recordings.dut import dut_clips
 from benchmarks.recordings.ngsim import ngsim_windows
@@ -175,8 +176,8 @@ class RecordingOptions:
             "--sets",
             help="Of megvii, centerpoint, camera, kitti, simulated; either LiDAR on the camera's scene, alone and with "
             "it: megvii_alone, megvii_fused, centerpoint_alone, centerpoint_fused; confused (classes); with made "
-            "detections ngsim, ngsim_without_road (no lanes, no lights), openacc, dut, crossings (simulated, without "
-            "signals), eth_ucy and crowds (simulated).  [default: the first five]",
+            "detections ngsim, ngsim_without_road (no lanes, no lights), openacc, dut, av2, crossings (simulated, "
+            "no signals), eth_ucy and crowds (simulated).  [default: the first five]",
         ),
     ] = None
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Simulated scenes.")] = 10
@@ -184,8 +185,8 @@ class RecordingOptions:
         str | None,
         typer.Option(
             "--viewpoint",
-            help="Of the sensors in the sets ngsim, openacc, dut and crossings: mast, above, where nothing is hidden, "
-            "vehicle, the id of one, or X,Y,Z in m.  [default: above in gaps, else mast, vehicle, above]",
+            help="Of the sensors in the sets ngsim, openacc, dut, av2 and crossings: mast, above, where nothing is "
+            "hidden, vehicle, the id of one, or X,Y,Z in m.  [default: above in gaps, else mast, vehicle, above]",
         ),
     ] = None
     test: Annotated[str | None, typer.Option("--test", help="Take these recordings alone, with commas.")] = None
@@ -418,5 +419,6 @@ TRAFFIC_SETS: dict[str, tuple[Callable[[Path], Recordings], str]] = {
     "ngsim" + WITHOUT_ROAD: (partial(ngsim_windows, road="none"), MAST),
     "openacc": (openacc_platoons, VEHICLE),
     "dut": (dut_clips, MAST),
+    "av2": (argoverse_logs, MAST),
 }
 """Recorded traffic, whose detections are made, and the usual viewpoint; taken only where it is asked for."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from benchmarks.gap_runs import CURVE
 from benchmarks.runner import chosen
 from pipelines.config import METHODS, Method, TrackConfig
 from pipelines.configuration import load_settings
@@ -93,6 +94,7 @@ def variants(family: str | Path) -> dict[str, Variant]:
     """All, by name, for the settings of a kind of data."""
     found = (
         *SHIPPED,
+        Variant(CURVE, "kf"),
         Variant("trails alone", changes={"tracker.edges": ()}),
         Variant("without trails", changes={"tracker.traffic.reach": 0.0}),
         Variant("class beliefs", changes={"sensors.*.confusion": CONFUSED}),
@@ -114,7 +116,7 @@ def contenders(family: str | Path, base: TrackConfig, wanted: str, own: Sequence
     known, found = variants(family), list[Contender]()
     for name in chosen("--contenders", wanted, tuple(known)):
         made = known[name].contender(base)
-        if not any((each.method, each.config) == (made.method, made.config) for each in found):
+        if name == CURVE or not any((one.method, one.config) == (made.method, made.config) for one in found):
             found.append(made)
     for text in own:
         title, _, path = text.partition("=")

@@ -5,7 +5,16 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from benchmarks.gap_runs import Judgement, LivedRun, Prediction, judgement, route_of, situations_of
+from benchmarks.gap_runs import (
+    CurveRun,
+    Judgement,
+    LivedRun,
+    Prediction,
+    by_hindsight,
+    judgement,
+    route_of,
+    situations_of,
+)
 from benchmarks.gaps import situation_figures
 from pipelines.learning.interactions import JudgedRun
 from saga_fg import Annotations, Boxes, Detections, Frame, Scene, Tracks
@@ -29,15 +38,17 @@ def labelled(
     colour: str | None = None,
     road: RoadMap | None = ROAD,
     label: str = "car",
+    walks: str = "",
 ) -> LabelledScene:
-    """Objects by their positions (K, 2), all detected but those unseen; the hidden one is "a"."""
+    """Objects by their positions (K, 2), all detected but those unseen; the hidden one is "a", `walks` a person."""
     truth, frames = [], []
     for k, time in enumerate(TIMES.tolist()):
         step = {name: way[min(k + 1, 25)] - way[max(k - 1, 0)] for name, way in ways.items()}
         speed = [v / (0.2 * (min(k + 1, 25) - max(k - 1, 0))) for v in step.values()]
         yaw = [np.arctan2(v[1], v[0]) for v in step.values()]
         position = [(*way[k], 1.0) for way in ways.values()]
-        boxes = Boxes.of([label] * len(ways), position, None, yaw, speed)
+        labels = ["pedestrian" if name == walks else label for name in ways]
+        boxes = Boxes.of(labels, position, None, yaw, speed)
         truth.append(Annotations(np.array(list(ways)), boxes, np.ones(len(ways), dtype=bool)))
         detected = boxes.select(np.array([name not in unseen for name in ways]))
         if colour is not None:
@@ -119,6 +130,52 @@ def test_merging_are_those_who_go_on_in_one_direction():
     assert {"going", "merging"} <= found({"a": STEADY, "b": joins})[2.0]
     assert "merging" in found({"a": joins, "b": STEADY})[2.0]
     assert "merging" not in found({"a": STEADY, "b": crosswise(3 * (TIMES - 4.0))})[2.0]
+
+
+def test_people_cross_the_ways_of_vehicles_which_wait_for_them():
+    halts = along(np.where(TIMES < 1.6, 5 * TIMES, np.where(TIMES < 3.0, 8.0, 8.0 + 6 * (TIMES - 3.0))))
+    walks = crosswise(2 * (TIMES - 3.2))
+    waiting = found({"a": halts, "b": walks}, walks="b")
+    assert "for people" not in waiting[1.0], "nobody is there yet"
+    assert waiting[2.0] & {"for people", "waiting", "people crossing"} == {"for people"}
+    assert "people crossing" in found({"a": walks, "b": halts}, walks="a")[2.0]
+    assert not found({"a": walks, "b": halts}, label="pedestrian")[2.0] & {"waiting", "people crossing"}, "all walk"
+
+
+def test_a_hidden_track_goes_on_in_a_curve_and_stops_where_it_brakes():
+    scene = labelled({"a": STEADY})
+
+    def ends(speed: FloatArray, turn: float = 0.0) -> FloatArray:
+        """The last place of the curve, and that of the motion with the acceleration that fades."""
+        tracks, x = [], np.cumsum(0.2 * speed)
+        for k, time in enumerate(TIMES.tolist()):
+            course = turn * min(time, 1.0)
+            velocity = speed[k] * np.array([np.cos(course), np.sin(course)])
+            boxes = Boxes.of(["car"], [[x[k], 0.0, 1.0]], velocity=[velocity])
+            seen = np.array([max(0.0, time - 1.0)])
+            tracks.append(Tracks(time, np.array([7]), boxes, np.ones(1), np.eye(2)[None], np.eye(2)[None], seen))
+        run = CurveRun(scene, tracks)
+        place = run.position(7, 25)
+        assert place is not None
+        return place - [x[5], 0.0]
+
+    np.testing.assert_allclose(ends(np.full(26, 5.0)), [20.0, 0.0], atol=1e-6)
+    faster = 5.0 + np.minimum(TIMES, 1.0)
+    t = 4.0
+    np.testing.assert_allclose(ends(faster)[0], 6 * t + 4 * (t - 4 * (1 - np.exp(-t / 4))), rtol=1e-3)
+    braked = np.maximum(5.0 - 3 * np.minimum(TIMES, 1.0), 0.0)
+    stops = 4 * np.log(3 / (3 - 2 / 4))
+    np.testing.assert_allclose(ends(braked)[0], 2 * stops - 3 * 4 * (stops - 4 * (1 - np.exp(-stops / 4))), atol=0.05)
+    turned = ends(np.full(26, 5.0), turn=0.2)
+    assert np.arctan2(turned[1], turned[0]) == pytest.approx(0.2 + 0.2 * 4 / 2, abs=0.02)
+
+
+def test_hindsight_has_the_lower_error_at_each_length():
+    ours, alone = situations_run("saga", "1", "1", [1.0, 3.0]), situations_run("trails alone", "1", "1", [2.0, 0.5])
+    (best,) = by_hindsight([ours, alone, situations_run("kf", "1", "1", [0.1, 0.1])])
+    assert [one.at[1.0] for one in best.outcomes] == [1.0, 0.5]
+    assert [one.predicted[1.0].error for one in best.outcomes] == [1.0, 0.5]
+    assert by_hindsight([ours]) == []
 
 
 def test_an_object_without_direction_has_no_route():

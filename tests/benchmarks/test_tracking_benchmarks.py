@@ -83,7 +83,7 @@ def test_the_command_compares_on_the_same_gaps(bench, tmp_path):
     assert everything["gaps"] + everything["lost"] == sum(row["gaps"] for row in counts)
 
 
-MADE = "ngsim or ngsim_without_road or openacc or dut or eth_ucy or crowds or crossings"
+MADE = "ngsim or ngsim_without_road or openacc or dut or av2 or eth_ucy or crowds or crossings"
 
 
 @pytest.mark.usefixtures("short_scenes")
