@@ -16,10 +16,8 @@ import yaml
 from click import Context
 from typer.main import get_command
 
-from benchmarks.pose_graphs import torus
 from data_tools.datasets.nuscenes.source import sensor_locations
 from data_tools.datasets.source import names
-from data_tools.pose_graphs import write_g2o
 from pipelines.cli import app
 from pipelines.cli.commands import PAGES, location
 from pipelines.cli.start import FIRST
@@ -192,13 +190,6 @@ def test_an_output_that_cannot_be_written_is_noticed_before_any_work(tmp_path, m
     assert said.startswith(f"error: {tmp_path / 'none' / 'out'}: not writable")
 
 
-def test_the_installed_command_runs_on_its_own(tmp_path):
-    """A separate process: a clean stdout, no progress bar where stderr is no terminal."""
-    run = subprocess.run([*COMMAND, "config", "--full"], capture_output=True, text=True, check=True, cwd=tmp_path)
-    assert run.stderr == ""
-    assert json.dumps(yaml.safe_load(run.stdout)["tracker"]["max_delay"]) == "0.5"
-
-
 # `saga-fg docs`: pages of a clone, and addresses without one
 
 
@@ -286,14 +277,6 @@ def test_while_the_output_is_written(tmp_path, arguments):
     assert left_behind(tmp_path) == []
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted({"in", "tmp", output.name} - {"labels"})
     assert not output.suffix or output.read_text() == "earlier"
-
-
-def test_while_slam_writes_its_folder(tmp_path):
-    write_g2o(tmp_path / "torus.g2o", torus(400, seed=0)[0])
-    process = start(tmp_path, "slam", "g2o", tmp_path / "torus.g2o", "--output", tmp_path / "solved")
-    assert terminate(process, lambda: there(tmp_path, ".solved.*.tmp/*")) == LINE
-    assert left_behind(tmp_path) == []
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["tmp", "torus.g2o"]
 
 
 def test_with_workers(tmp_path):

@@ -169,15 +169,6 @@ def test_a_result_is_the_same_sensor_in_every_scene_and_counts_where_it_is(
     assert found["tracks_2"].noise == usual.sensors["default"].noise
 
 
-def test_tracks_at_moments_without_a_detection_beside_a_table(tmp_path: Path) -> None:
-    rows = [f"{k / 10},car,{k},0" for k in range(30) if k % 5]
-    (tmp_path / "d.csv").write_text("\n".join(["timestamp,label,x,y", *rows]) + "\n")
-    rows = [f"{k / 10},1,car,{k},0.2" for k in range(40)]
-    (tmp_path / "t.csv").write_text("\n".join(["timestamp,id,label,x,y", *rows]) + "\n")
-    done("smooth", "file", tmp_path / "d.csv", "--tracks", tmp_path / "t.csv", "--output", tmp_path / "labels")
-    assert len((tmp_path / "labels" / "labels.csv").read_text().splitlines()) == 41
-
-
 def test_kitti_text_without_scores_is_sure_and_boxes_that_its_table_predicts_are_left_out(tmp_path: Path) -> None:
     source, theirs = KittiSource(dataroot=str(write_sequence(tmp_path)), scenes="0007"), tmp_path / "theirs"
     theirs.mkdir()

@@ -209,12 +209,6 @@ def test_the_same_in_a_file_and_in_options(tmp_path):
 # What `inspect` and `track` say of tables with oddities, and what mends them
 
 
-def added(text: str) -> list[str]:
-    """The options that a warning or a look says to add."""
-    (mend,) = re.findall(r"; (?:fill in and )?add (--\S+ \S+?)(?:; --as-given .*)?$", text, re.MULTILINE)
-    return shlex.split(str(mend))
-
-
 UNITS, CLASSES = ("--units", "angle=deg,score=percent"), ("--classes", "VEHICLE=car")
 
 

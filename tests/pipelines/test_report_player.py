@@ -358,15 +358,6 @@ def test_faults_and_differences_are_visited_one_after_the_other(tmp_path):
     assert found["last"] == ["3.5 s", "difference 4 of 4"]
 
 
-def test_a_page_without_truth_or_a_second_result_has_nothing_to_visit(tmp_path):
-    page = report_page(Report("plain", [], [crowded(["car"] * 2)]))
-    script = (
-        'found.shown = getComputedStyle($of("visits")).display; key("s"); key("v"); found.clock = $of("clock").value;'
-    )
-    found = tried_in_browser(page, HELPERS + script, tmp_path)
-    assert (found["faults"], found["shown"], found["clock"]) == ([], "none", "0.0 s")
-
-
 def test_relations_have_the_names_of_their_rules(tmp_path):
     class Admires:
         interaction = SharedVelocity()

@@ -553,13 +553,9 @@ def test_what_is_wrong_with_a_tool_or_its_files_is_one_line(labels, tmp_path):
     assert f"{out / 'b.json'}: there is no such" in done("review", labels, "--import", "openlabel", out).stderr
     assert f"{out}: expected a new or an empty folder" in refused("review", labels, "--export", "openlabel", out)
     whole = (out / "a.json").read_text()
-    for text, expected in (
-        (whole[:-9], "a.json: broken or truncated JSON"),
-        (whole.replace('"23": {"frame', '"24": {"frame'), "a.json: frame 24: expected each frame once, of"),
-    ):
-        (out / "a.json").write_text(text)
-        assert expected in refused("review", labels, "--import", "openlabel", out)
-        assert not (labels / CORRECTIONS).exists()
+    (out / "a.json").write_text(whole[:-9])
+    assert "a.json: broken or truncated JSON" in refused("review", labels, "--import", "openlabel", out)
+    assert not (labels / CORRECTIONS).exists()
     (out / "a.json").write_text(whole.replace('"type": "car"', '"type": "kart"'))
     told = done("review", labels, "--import", "openlabel", out)
     assert "class kart: taken over, no label has had it before" in told.stderr

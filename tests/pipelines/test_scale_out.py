@@ -3,17 +3,16 @@
 import fcntl
 import json
 import os
-import secrets
-import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
+from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -26,6 +25,7 @@ from pipelines.scale_out import (
     LocalPool,
     Manifest,
     OutputFolder,
+    RayPool,
     RunSummary,
     SceneTask,
     TrackTask,
@@ -306,42 +306,21 @@ def test_a_ray_cluster_of_two_workers_of_which_one_is_killed(tmp_path):
     assert content(tmp_path / "ray") == content(tmp_path / "serial")
 
 
-@pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """The address of a cluster of two CPUs that `ray start` has made, and that ends with its processes."""
-    pytest.importorskip("ray", reason="Ray comes with the extra ray")
-    monkeypatch.setenv("RAY_AUTH_MODE", "token")  # handed out by the environment, as the guide says
-    monkeypatch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(32))
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    folder = Path(tempfile.mkdtemp(prefix="ray"))  # short: Ray puts sockets into it
-    ray = [sys.executable, "-c", "from ray.scripts.scripts import main; main()", "start", "--head", "--block"]
-    ray += ["--node-ip-address", "127.0.0.1", "--port", address.rpartition(":")[2], "--num-cpus", "2"]
-    ray += ["--include-dashboard", "false", "--temp-dir", str(folder)]
-    with (folder / "log").open("w") as log:
-        head = subprocess.Popen(ray, stdout=log, stderr=log, start_new_session=True)
-    try:
-        while "Ray runtime started" not in (folder / "log").read_text():
-            assert head.poll() is None, (folder / "log").read_text()
-            time.sleep(0.2)
-        yield address
-    finally:
-        os.killpg(head.pid, signal.SIGTERM)
-        head.wait()
-        shutil.rmtree(folder, ignore_errors=True)
+def test_a_cluster_elsewhere_is_asked_by_its_address_and_named_where_there_is_none(monkeypatch):
+    asked = []
 
+    def init(**options: object) -> None:
+        asked.append(options)
+        raise ConnectionError("refused\nby a firewall")
 
-def test_a_cluster_that_is_there_already(cluster, tmp_path):
-    write_recordings(tmp_path / "in", 3)
-    pattern = str(tmp_path / "in" / "*.csv")
-    command = [*COMMAND, "track", "file", pattern, "--ray", cluster, "--output", str(tmp_path / "ray")]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-    assert done.returncode == 0, done.stderr
-    assert "3 scenes: 3 done, 0 unchanged, 0 failed" in done.stdout
-    assert saga_fg("track", "file", pattern, "--workers", "1", "-o", tmp_path / "serial").exit_code == 0
-    assert content(tmp_path / "ray") == content(tmp_path / "serial")
+    ray = ModuleType("ray")
+    ray.__spec__ = ModuleSpec("ray", None)
+    vars(ray)["init"] = init
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    with pytest.raises(InputError, match=r"--ray 10\.0\.0\.1:6379: no cluster there: refused$"):
+        list(RayPool("10.0.0.1:6379", 2).outcomes(iter(()), 0))
+    assert asked[0]["address"] == "10.0.0.1:6379"
+    assert "num_cpus" not in asked[0]
 
 
 def test_without_ray_the_extra_is_named(tmp_path, monkeypatch):

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from benchmarks.scans import LaserKind, laser_drive
-from data_tools.laser import LaserLog, read_carmen
+from data_tools.laser import LaserLog
 from data_tools.trajectories import read_tum_poses
 from pipelines.slam.laser_slam import LaserSettings, LaserSlam, laser_slam
 from saga_fg import InputError
 from saga_fg.numerics import transform, transforms, vectors
-from tests.data_tools.carmen_example import NO_RETURN, write_carmen
-from tests.pipelines.command import done, refused
+from tests.data_tools.carmen_example import write_carmen
+from tests.pipelines.command import done
 
 
 def test_loops_are_closed_and_the_path_is_right(tmp_path: Path) -> None:
@@ -60,13 +60,6 @@ def test_scans_that_hit_nothing_go_by_the_wheels() -> None:
     ranges[30:40] = np.nan
     path = laser_slam(LaserLog(log.time, ranges, log.angles, log.odometry, log.robot_T_laser), LaserSettings())
     assert np.linalg.norm(path.poses[:, :2, 2] - true[:, :2, 2], axis=1).max() < 0.15
-
-
-def test_a_broken_log_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "bad.log").write_text("FLASER 3 1 2 3\n")
-    said = refused("slam", "laser", tmp_path / "bad.log", "--output", tmp_path / "out")
-    assert "line 1: expected a number of readings from 10" in said
-    assert not (tmp_path / "out").exists()
 
 
 def test_the_path_starts_at_the_wheels_until_a_scan_hits_something() -> None:
@@ -159,21 +152,3 @@ def test_a_bad_step_is_refused(subtests: pytest.Subtests) -> None:
     ]:
         with subtests.test(message), pytest.raises(InputError, match=message):
             LaserSlam().step(points, odometry)
-
-
-def test_interlaced_scans_are_as_good_as_others(tmp_path: Path) -> None:
-    """Every other scan has the directions between those of the one before, as a log of a laser that interlaces."""
-    log, true = laser_drive(0, rounds=0.2, kind=LaserKind(readings=360))
-    lines = []
-    for row, (time, pose) in enumerate(zip(log.time, log.odometry, strict=True)):
-        both = (log.angles[row], np.nan_to_num(log.ranges[row], nan=NO_RETURN))
-        angles, ranges = (values[row % 2 :: 2] for values in both)
-        at = " ".join(f"{value:.6f}" for value in pose)
-        step = angles[1] - angles[0]
-        head = f"ROBOTLASER1 0 {angles[0]:.6f} {np.pi:.6f} {step:.8f} 81.9 0.01 0 {len(ranges)}"
-        readings = " ".join(f"{r:.3f}" for r in ranges)
-        lines.append(f"{head} {readings} 0 {at} {at} 0 0 0 0 0 {time:.6f} nohost {time:.6f}\n")
-    (tmp_path / "drive.log").write_text("".join(lines))
-    both = [laser_slam(each, LaserSettings()).poses for each in (log, read_carmen(tmp_path / "drive.log"))]
-    errors = [np.linalg.norm((poses - true)[:, :2, 2], axis=1).max() for poses in both]
-    assert errors[1] < max(1.5 * errors[0], 0.1)

@@ -235,14 +235,6 @@ def test_a_fix_counts_as_long_as_the_vehicle_is_near(
     assert asked[-2:] == last
 
 
-def test_where_the_map_has_no_such_place_none_is_found(known: SlamMap) -> None:
-    scans = SimulatedScans(8, world_T_lidar=drive(0.0, 0.0, 24))
-    localiser = Localiser(known, settings=LocaliserSettings(search_distance=10.0))
-    steps = [localiser.step(scans[k], 0.1 * k) for k in range(24)]
-    assert all(step.map_T_lidar is None for step in steps)
-    assert localiser.path() is None
-
-
 def test_the_files_of_a_run_are_a_map_and_a_graph(tmp_path: Path) -> None:
     """What SLAM has written is read back: submaps, pose graph, landmarks; a second drive finds itself in it."""
     scans = SimulatedScans(3, world_T_lidar=drive(0.0, -1.5, 40))

@@ -19,7 +19,7 @@ from pipelines.slam.results import write_lidar_slam
 from saga_fg import Boxes, Detections, Frame, InputError
 from saga_fg.numerics import inverse_transform, yaw_transform
 from saga_fg.slam.sensors import SensorName, SensorSettings
-from tests.pipelines.command import done, refused
+from tests.pipelines.command import done
 
 MOVER = np.array([8.0, -1.5]), np.array([7.0, 0.0])  # m, m/s
 
@@ -120,9 +120,3 @@ def test_the_command_with_objects(recordings: Path, tmp_path: Path) -> None:
     assert figures["objects"] > 0
     assert {"map", "map.ply"} <= {file.name for file in (tmp_path / "run").iterdir()}
     assert (tmp_path / "run" / "tracks.csv").read_text().count("\n") > 10
-
-
-def test_sequences_without_scans_are_named(recordings: Path, tmp_path: Path) -> None:
-    arguments = [str(recordings / "kitti"), "--sequence", "0004", "--output", str(tmp_path / "run")]
-    assert "--sequence: unknown sequence '0004'" in refused("slam", "scans", *arguments)
-    assert not (tmp_path / "run").exists()

@@ -63,21 +63,6 @@ def test_nuscenes_labels_are_complete(tmp_path):
     assert gains == sorted(gains, reverse=True)
 
 
-def test_own_tables_become_labels_with_gaps_filled(tmp_path):
-    table = tmp_path / "detections.csv"
-    with table.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["timestamp", "x", "y", "length", "width", "height", "yaw", "label", "score"])
-        for k in range(20):
-            there = [0.1 * k, 1.0 * k, 0.0, 4.5, 1.9, 1.6, 3.14159 * (k % 2), "car", 0.9]
-            writer.writerow(there if k not in (8, 9) else [0.1 * k, *[""] * 8])
-    done("smooth", "file", table, "-o", tmp_path / "labels")
-    rows = read_tracks(tmp_path / "labels" / "labels.csv", labels=True)
-    assert rows.source.tolist() == ["filled" if k in (8, 9) else "observed" for k in range(20)]
-    assert abs(rows.boxes.yaw).max() < 0.1  # flipped detections, and the car drives along x
-    assert abs(rows.boxes.position[8, 0] - 8.0) < 0.2
-
-
 def test_an_output_that_cannot_be_written_is_found_before_the_work(tmp_path):
     assert "does not exist" in refused("smooth", "simulated", "-o", tmp_path / "missing" / "labels")
 

@@ -8,7 +8,7 @@ pytest.importorskip("mcap_ros2")
 pytest.importorskip("rosbags")
 
 from data_tools.datasets.mcap.dataset import McapRecording
-from data_tools.datasets.mcap.source import TOPIC, McapSource, read_track_messages
+from data_tools.datasets.mcap.source import TOPIC, McapSource
 from pipelines.report.page import read_run_record
 from tests.data_tools import mcap_example as example
 from tests.data_tools.mcap_example import ARRAY, LIDAR, MOMENTS, START, STEP
@@ -73,28 +73,6 @@ def test_tracks_in_another_frame_are_shown_in_it_or_refused(tmp_path, drive):
             done(*page, "--world", "base_link")
         else:
             assert McapSource(recording=[str(drive)]).with_kept(read_run_record(tracks).recordings).world == "base_link"
-
-
-def test_tracks_are_read_back_as_they_were(tmp_path, drive):
-    from data_tools.datasets.detection_files import read_tracks
-
-    for suffix in ("mcap", "csv"):
-        done("track", "mcap", drive, "--output", tmp_path / f"tracks.{suffix}")
-    recording = McapRecording(drive)
-    scene = recording.scene("drive")
-    a, b = (
-        read_track_messages(tmp_path / "tracks.mcap", scene.name, {}, scene.world),
-        read_tracks(tmp_path / "tracks.csv"),
-    )
-    assert a.id.tolist() == b.id.tolist()
-    assert a.timestamp == pytest.approx(b.timestamp, abs=1e-6)
-    assert a.boxes.label.tolist() == b.boxes.label.tolist()
-    assert a.boxes.position == pytest.approx(b.boxes.position)
-    assert a.boxes.velocity == pytest.approx(b.boxes.velocity, abs=1e-9)
-    assert a.boxes.size == pytest.approx(b.boxes.size)
-    assert a.score == pytest.approx(b.score, abs=1e-6)
-    assert a.position_covariance == pytest.approx(b.position_covariance)
-    assert a.velocity_covariance == pytest.approx(b.velocity_covariance, rel=1e-6, abs=1e-9)
 
 
 def test_several_recordings_in_parallel_and_again(tmp_path, drive):

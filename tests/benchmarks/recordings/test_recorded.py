@@ -10,12 +10,11 @@ import pytest
 from benchmarks.crossings import simulated_crossings
 from benchmarks.recordings.ngsim import ngsim_windows
 from benchmarks.recordings.sources import Ngsim, sensed_scene, true_scene
-from benchmarks.recordings.traffic import RecordedTraffic, Recordings
+from benchmarks.recordings.traffic import RecordedTraffic
 from data_tools.simulator.settings import SensorSettings, SimulatorSettings
 from pipelines.config import load_config
 from pipelines.learning import scenes_to_learn_from
 from saga_fg.errors import InputError
-from saga_fg.numerics.geometry import feet, on_it
 from saga_fg.types.dataset import Scene
 from tests.benchmarks.recordings.ngsim_example import crossing, rows, write_ngsim
 from tests.pipelines.command import done
@@ -127,56 +126,6 @@ def test_a_source_opens_chosen_windows(tmp_path):
         Ngsim(dataroot=str(tmp_path), scenes="C").open(),
     ):
         pass
-
-
-# NGSIM windows and OpenACC platoons as recorded: where vehicles drive, who stops, and platoons in order
-
-
-@pytest.fixture(scope="module")
-def ngsim(recordings: Path) -> Recordings:
-    if not (recordings / "ngsim").is_dir():
-        pytest.skip("no NGSIM windows among the recordings")
-    return ngsim_windows(recordings / "ngsim")
-
-
-def test_vehicles_drive_in_the_lanes_of_the_map(ngsim):
-    traffic = ngsim.read("USA_Lanker-2_6_T-1")
-    assert traffic.road_map is not None
-    position, yaw = traffic.vehicles.position[traffic.vehicles.present], traffic.vehicles.yaw[traffic.vehicles.present]
-    inside = np.zeros(len(position), dtype=bool)
-    for lane in traffic.road_map.lanes:
-        centre = np.array(lane.centre)
-        foot = feet(centre, position)
-        along = np.cos(np.arctan2(*foot.direction.T[::-1]) - yaw) > 0.7
-        inside |= along & on_it(centre, foot.s) & (np.abs(foot.e) < lane.width / 2)
-    assert inside.mean() > 0.95
-
-
-def standing_at_lines(traffic: RecordedTraffic) -> dict[str, list[bool]]:
-    """Whether vehicles within 12 m before a line stand, by the colour that is shown."""
-    found: dict[str, list[bool]] = {"red": [], "amber": [], "green": []}
-    assert traffic.road_map is not None
-    for line in traffic.road_map.stop_lines:
-        (left, right), shown = line.ends, traffic.colours[line.light]
-        ahead, width = np.array([np.cos(line.heading), np.sin(line.heading)]), np.hypot(*(line.ends[1] - line.ends[0]))
-        across = (traffic.vehicles.position - left) @ ((right - left) / width)
-        way = (left - traffic.vehicles.position) @ ahead - traffic.vehicles.size[:, 0] / 2
-        comes = traffic.vehicles.present & (np.abs(way - 5.5) < 6.5) & (np.abs(across - width / 2) < width / 2)
-        comes &= np.cos(traffic.vehicles.yaw - line.heading) > 0.8
-        for k, n in zip(*np.nonzero(comes), strict=True):
-            found[str(shown[k])].append(bool(np.hypot(*traffic.vehicles.velocity[k, n]) < 0.5))
-    return found
-
-
-def test_vehicles_stand_at_red_and_go_at_green(ngsim):
-    stand: dict[str, list[bool]] = {"red": [], "amber": [], "green": []}
-    for name in ngsim.names:
-        if "Lanker" in name:
-            for colour, found in standing_at_lines(ngsim.read(name)).items():
-                stand[colour] += found
-    assert min(len(stand["red"]), len(stand["green"])) > 1000
-    assert np.mean(stand["red"]) > 0.85
-    assert np.mean(stand["green"]) < 0.2
 
 
 # Simulated crossings without signals

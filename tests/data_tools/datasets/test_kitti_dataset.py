@@ -18,7 +18,7 @@ from data_tools.datasets.kitti import (
 )
 from data_tools.datasets.kitti.source import read_scored_sequences
 from data_tools.metrics.kitti_boxes import CameraBoxes, has_box
-from saga_fg import Dataset, InputError, Tracks
+from saga_fg import InputError, Tracks
 from saga_fg.numerics.geometry import inverse_transform, transform_points
 from tests.data_tools.kitti_example import CALIBRATION, LABELS, calibration_text, oxts_line, write_sequence
 
@@ -26,16 +26,6 @@ from tests.data_tools.kitti_example import CALIBRATION, LABELS, calibration_text
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     return write_sequence(tmp_path)
-
-
-def test_scene(root):
-    data: Dataset = KittiTracking(root, root / "found")
-    assert data.scenes == ("0007",)
-    scene = data.scene("0007")
-    np.testing.assert_allclose(scene.timestamps, [0, 0.1, 0.2])
-    np.testing.assert_allclose(scene.world_T_ego[:, 0, 3], [0, 1, 2], atol=1e-6)
-    assert scene.tokens == ("000000", "000001", "000002")
-    assert scene.ground_truth is None
 
 
 def test_every_moment_has_a_frame(root):
@@ -238,11 +228,6 @@ def test_box_that_does_not_show(subtests):
     for place in [(0, 1, -10), (-30, 1, 10), (30, 1, 10), (0, 40, 10), (0, -40, 10), (0, 1, -0.95)]:
         with subtests.test(place=place):
             assert np.isnan(image_boxes(box(*place), P2, IMAGE)).all()
-
-
-def test_no_boxes():
-    none = CameraBoxes(np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
-    assert image_boxes(none, P2, IMAGE).shape == (0, 4)
 
 
 def test_observation_angle_is_seen_from_the_camera():

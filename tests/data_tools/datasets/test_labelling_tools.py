@@ -264,11 +264,6 @@ def test_what_is_wrong_in_a_file_of_a_tool_is_one_line(name, tmp_path):
     assert "\n" not in str(error.value)
 
 
-def test_an_unknown_tool_is_named():
-    with pytest.raises(InputError, match=r"unknown labelling tool 'openlable'; did you mean 'openlabel'"):
-        write_for_tool(Path("a"), "openlable", made())
-
-
 def test_differences_within_what_tools_round_are_none():
     result = exchanged(made())
     boxes = replace(result.found.boxes, position=result.found.boxes.position + 0.9 * SAME * np.array([1, 0, 0]))

@@ -160,15 +160,6 @@ def test_along_a_tunnel_the_prediction_stays():
     assert found.observed.names(np.array([0.0, 1.0, 0.0]))[-1] == "across the road"  # of a way to the left
 
 
-def test_a_whole_registration_refuses(subtests):
-    for world in [tunnel(), open_field()]:
-        with (
-            subtests.test(world=world),
-            pytest.raises(RegistrationError, match="leave a direction of motion unconstrained"),
-        ):
-            registered(world, np.eye(4), undetermined="refuse")
-
-
 # Points inside boxes of objects
 
 

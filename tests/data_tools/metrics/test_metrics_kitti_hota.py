@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from data_tools.datasets.kitti.labels import read_kitti_labels
-from data_tools.metrics import HotaMetrics, KittiTrackingSequence, kitti_hota_metrics
+from data_tools.metrics import KittiTrackingSequence, kitti_hota_metrics
 
 trackeval = pytest.importorskip("trackeval")
 
-CAR = (100.0, 100.0, 180.0, 150.0)
+CAR, ELSEWHERE = (100.0, 100.0, 180.0, 150.0), (400.0, 100.0, 480.0, 150.0)
+TYPES = ("Car", "Car", "Van", "Pedestrian", "Person")
 
 
 def line(
@@ -28,14 +29,6 @@ def sequence(folder: Path, truth: list[str], found: list[str]) -> KittiTrackingS
     return KittiTrackingSequence(*objects)
 
 
-def figures(folder: Path, truth: list[str], found: list[str], label: str = "car") -> HotaMetrics:
-    cars = [line(k, 1, label.capitalize(), CAR) for k in range(4)]
-    return kitti_hota_metrics([sequence(folder, cars + truth, cars + found)], label)
-
-
-ELSEWHERE = (400.0, 100.0, 480.0, 150.0)
-
-
 def test_in_space_the_same_objects_are_evaluated(tmp_path):
     truth = [line(0, 1, "Car", CAR), line(0, 2, "Van", ELSEWHERE, x=10.0)]
     found = [line(0, 7, "Car", CAR, x=1.0), line(0, 9, "Car", ELSEWHERE, x=14.0)]
@@ -51,7 +44,7 @@ def traffic(seed: int) -> tuple[list[str], list[str]]:
     rng = np.random.default_rng(seed)
     truth, found = [], []
     places, speeds = rng.uniform((0, 100), (1100, 250), (12, 2)), rng.normal(0, 6, (12, 2))
-    sizes, types = rng.uniform((20, 15), (120, 70), (12, 2)), rng.choice(["Car", "Car", "Van", "Pedestrian"], 12)
+    sizes, types = rng.uniform((20, 15), (120, 70), (12, 2)), rng.choice(TYPES, 12)
     for k in range(25):
         for n in range(12):
             corner = places[n] + k * speeds[n]
@@ -60,7 +53,7 @@ def traffic(seed: int) -> tuple[list[str], list[str]]:
                 truth.append(line(k, n, types[n], box, (int(rng.random() < 0.1), int(rng.integers(0, 4)))))
             if rng.random() < 0.8:
                 moved = np.array(box) + rng.normal(0, 4, 4)
-                type_ = "Car" if types[n] != "Pedestrian" else "Pedestrian"
+                type_ = "Car" if types[n] in ("Car", "Van") else "Pedestrian"
                 found.append(line(k, 100 + n + 20 * (rng.random() < 0.05), type_, tuple(moved)))
         area = rng.uniform((0, 80), (900, 150))
         truth.append(line(k, -1, "DontCare", (*area, area[0] + 250, area[1] + 100)))
