@@ -133,21 +133,6 @@ def test_many_factors_equal_one_by_one(seed, covariance):
         np.testing.assert_allclose(factor.augmentedJacobian(), alone.augmentedJacobian(), atol=1e-12)
 
 
-def test_elimination_passes_on_what_it_does_not_touch(covariance):
-    rng = np.random.default_rng(0)
-    graph = random_graph(rng, {1: 2, 2: 3}, covariance)
-    assert marginal_factors(graph, []).size() == graph.size()
-    assert marginal_factors(graph, [1, 2]).keyVector() == []
-    rng = np.random.default_rng(0)
-    alone = prior_factor(3, rng.normal(size=2), covariance(rng, 2))
-    graph = random_graph(rng, {1: 2, 2: 3}, covariance)
-    graph.push_back(alone)
-    remaining = marginal_factors(graph, [1])
-    assert any(
-        factor.keys() == [3] and factor.equals(alone, 0.0) for factor in map(remaining.at, range(remaining.size()))
-    )
-
-
 def test_unknown_keys_and_eliminations_are_refused(covariance, subtests):
     graph = gaussian_graph([prior_factor(1, [0.0], [[1.0]])])
     with pytest.raises(FactorError, match="no variable x7"):

@@ -6,16 +6,12 @@ import pytest
 
 from factors import (
     FactorError,
-    RangeBearing,
-    Robust,
     SingularSystemError,
     SolverSettings,
     Vector,
-    detection_factors,
     gaussian_factor,
     gaussian_graph,
     interaction_factor,
-    linearised,
     nonlinear_graph,
     prior_factor,
     prior_factors,
@@ -117,17 +113,6 @@ def test_step_to_where_a_factor_is_undefined_is_shortened():
         assert solution.values.atVector(0)[0] == pytest.approx(2.0, abs=1e-8)
 
 
-def test_robust_mean_is_the_weighted_one():
-    rng = np.random.default_rng(2)
-    z = np.concatenate([rng.normal(size=(40, 2)), 30 + rng.normal(size=(8, 2))])
-    robust = Robust("cauchy", 1.0)
-    factors = [on_vector(lambda x, measured=measured: x - measured, robust=robust) for measured in z]
-    mean = solve(EMPTY, factors, values_of({0: np.median(z, axis=0)})).values.atVector(0)
-    weight = robust.weight(np.linalg.norm(z - mean, axis=1))
-    np.testing.assert_allclose(mean, (weight[:, None] * z).sum(axis=0) / weight.sum(), atol=1e-5)
-    assert np.linalg.norm(mean) < 1.0
-
-
 def test_free_variables_and_directions_are_named_in_systems_of_any_size():
     between = gaussian_factor(X[1:3], [np.eye(2), -np.eye(2)], [0.0, 0.0])
     graph = nonlinear_graph([prior_factor(X[0], [0.0, 0.0], np.eye(2)), between], dict.fromkeys(X, 2))
@@ -174,15 +159,6 @@ def test_what_gtsam_cannot_evaluate_is_a_factor_error():
     factor.getb()[0] = np.nan
     with pytest.raises(FactorError, match="not finite"):
         solve(nonlinear_graph([factor], {X[0]: 1}), [], values_of({X[0]: np.zeros(1)}))
-
-
-def test_solution_passes_on_its_linear_factors():
-    model, z = RangeBearing(2), np.array([5.0, 0.5])
-    factors = [detection_factors([0], model, [z], np.diag([0.01, 0.001])) for _ in range(2)]
-    solution = solve(EMPTY, factors, values_of({0: np.array([4.0, 1.0])}))
-    again = linearised(EMPTY, factors, solution.values)
-    np.testing.assert_allclose(solution.linear.hessian()[0], again.hessian()[0])
-    np.testing.assert_allclose(solution.covariance([0]), np.linalg.inv(again.hessian()[0]), rtol=1e-9)
 
 
 def test_bad_settings_are_refused(subtests):

@@ -216,14 +216,6 @@ def test_rules_and_sensors_by_name(mine):
     assert read_settings(TrackConfig, write_settings(found)) == found
 
 
-def test_an_estimator_is_a_class_as_well_as_a_name(mine):
-    from saga_fg.estimators import JointKalmanFilter
-
-    by_class, by_name = (TrackerSettings(estimator=each) for each in (JointKalmanFilter, "kalman"))
-    assert run(Tracker(by_class)) == run(Tracker(by_name))
-    assert "estimator JointKalmanFilter" in repr(Tracker(by_class))
-
-
 def test_a_cost_forbids_pairs_and_one_of_zeros_changes_nothing(mine):
     never = TrackerSettings(association=AssociationSettings(costs=(mine.Never("lidar"),)))
     tracker = Tracker(never)

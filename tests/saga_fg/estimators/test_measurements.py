@@ -132,11 +132,6 @@ def test_where_a_bearing_is_undefined_is_an_error_after_which_all_goes_on(subtes
             assert 2.0 < estimator.mean([1])[0, 0] < 3.0
 
 
-def test_relinearisation_makes_a_difference():
-    model = MODELS["range and bearing"]
-    assert apart(told(JointKalmanFilter(), model, offset=1.0), told(GraphFilter(()), model, offset=1.0)) > 0.01
-
-
 # Covariances that are not smaller than others
 
 

@@ -16,7 +16,7 @@ from factors.gaussian import native_factor
 from pipelines.explaining import story
 from pipelines.serving.messages import tracks_message
 from saga_fg import Edges, InputError, NodeType, SceneGraph, Tracker, TrackerSettings
-from saga_fg.conformance.programs import CAR, Predict, TextbookEstimator, random_graph, random_program, run
+from saga_fg.conformance.programs import CAR, random_graph, random_program, run
 from saga_fg.estimators import GraphFilter, IncrementalSmoother, JointKalmanFilter, Measurements, filtering
 from saga_fg.graph import OBJECT, Additions, GraphView, NewVariable
 from saga_fg.model.discretisation import discretise
@@ -132,42 +132,6 @@ def test_a_snapshot_leaves_the_graph_as_it_is(subtests):
             assert content(estimator.graph()) == content(resumed.graph()) == before
             estimator.predict(discretise(SceneGraph.of([0, 1, 3], CAR), 0.0))  # no time at all
             assert content(estimator.graph()) == before
-
-
-def test_copies_go_on_independently_of_each_other():
-    """Whichever of them has GTSAM's tree."""
-    rng = np.random.default_rng(7)
-    interval = discretise(random_graph(rng, (CAR,) * 4, range(4), density=1.0), 0.1)
-    original, textbook = GraphFilter(), TextbookEstimator()
-    programs = [[Predict(interval)], [Predict(interval), Predict(interval)], [Predict(interval)] * 3]
-    prior = range(4), rng.normal(size=(4, 4)), random_covariance(rng, 4, 4)
-    for one in (original, textbook):
-        one.add(*prior)
-        one.predict(interval)
-        one.update(seen(np.random.default_rng(1), [0, 1]))
-    for program, one in zip(programs, [copy.copy(original), copy.copy(original), original], strict=True):
-        expected = copy.deepcopy(textbook)
-        for either in (one, expected):
-            run(program, either)
-            either.update(seen(np.random.default_rng(2), [1, 2, 3]))
-        P = expected.joint_covariance(range(4))
-        assert np.abs((one.joint_mean(range(4)) - expected.joint_mean(range(4))) / np.sqrt(np.diag(P))).max() < 1e-9
-        assert np.linalg.norm(one.joint_covariance(range(4)) - P) < 1e-9 * np.linalg.norm(P)
-
-
-def test_a_node_that_is_removed_and_added_at_one_time_is_another_one_in_the_graph():
-    rng = np.random.default_rng(3)
-    estimator = running(rng)
-    others = Counter(one.provider for one in estimator.graph().factors())["interactions"] - 1
-    for again in range(2):
-        estimator.marginalise([1])
-        estimator.add([1], [[float(again)] * 4], random_covariance(rng, 1, 4))
-        graph = estimator.graph()
-        newest = graph.of(OBJECT, graph.epoch)
-        assert Counter(one.provider for one in graph.factors())["interactions"] == others, "the last interval"
-        np.testing.assert_allclose(graph.state(newest[1].key), [float(again)] * 4)
-    estimator.predict(discretise(random_graph(rng, (CAR,) * 4, range(4), density=0.7), 0.2))
-    assert estimator.graph().of(OBJECT, estimator.graph().epoch).keys() == {0, 1, 2, 3}
 
 
 class TreeWithoutDigits:
@@ -372,18 +336,6 @@ def test_what_has_not_settled_is_not_better_known_than_predicted(lag):
     assert reported[4, 4] < 0.8 * predicted[4, 4]  # the other one is measured as ever
     _, P = estimator.planar_marginals([1], np.array([[0, 1, 2, 3]]))
     np.testing.assert_allclose(P[0], reported[:4, :4])
-
-
-@pytest.mark.parametrize("lag", [0.0, 0.25])
-def test_the_graph_has_what_has_not_settled_where_the_filter_has_it(lag):
-    estimator = filtered(Uphill([1]), lag=lag)
-    graph = estimator.graph()
-    newest = graph.of(OBJECT, graph.epoch)
-    assert len(estimator._independent.layout.nodes) == 1
-    for node in (1, 2):
-        np.testing.assert_allclose(graph.state(newest[node].key), estimator.mean([node])[0], atol=1e-9)
-    latest = estimator.smoothed()[-1]
-    np.testing.assert_allclose(latest.x.mean, estimator.mean([1, 2]).ravel(), atol=1e-9)
 
 
 def test_what_has_settled_is_said_again_and_after_a_restart():

@@ -87,9 +87,9 @@ MOST = {"filter": (2e-9, 1e-8, 3e-8), "lag": (5e-9, 1e-9, 3e-8), "all": (5e-9, 1
 def test_random_programs_agree_with_the_textbook(kind, subtests):
     """New and leaving nodes, misses, several sensors, graphs that change, nodes of four kinds; then milliseconds beside
     seconds, with constant velocity: the noise of constant acceleration falls with the fifth power of the interval."""
-    for seed in range(4):
+    for seed in range(3):
         with subtests.test(seed=seed):
-            usual = random_program(np.random.default_rng(seed), moments=7, intervals=USUAL)
+            usual = random_program(np.random.default_rng(seed), moments=6, intervals=USUAL)
             assert (largest_errors(usual, KINDS[kind]()) < MOST[kind]).all()
             fast = random_program(np.random.default_rng(seed), moments=9, intervals=MILLISECONDS, kinds=(CAR, CONE))
             assert max(largest_errors(fast, KINDS[kind]())) < 1e-9
@@ -187,14 +187,6 @@ def test_what_is_ones_own_acts(name):
     assert np.abs(whole - driven(BACK_ENDS[name](), sprung=False)).max() > 0.05
     assert np.abs(whole - driven(BACK_ENDS[name](), motion=Whirl)).max() > 0.5
     assert np.abs(whole - driven(BACK_ENDS[name](), seen=False)).max() > 0.02
-
-
-@pytest.mark.parametrize("name", [name for name in BACK_ENDS if name != "kalman"])
-def test_before_anything_is_measured_all_answer_alike(name, subtests):
-    for motion in [ConstantVelocity, Whirl]:
-        with subtests.test(motion=motion):
-            kalman = driven(JointKalmanFilter(), motion=motion, seen=False)
-            np.testing.assert_allclose(driven(BACK_ENDS[name](), motion=motion, seen=False), kalman, atol=1e-9)
 
 
 # Law 2 of the running graph: nothing marginalised, iSAM2 is Levenberg-Marquardt on everything; with a lag, consistent
@@ -391,13 +383,3 @@ def test_a_provider_sees_what_was_known_before_its_epoch():
             answers.append(curious.known)
         np.testing.assert_allclose(*answers, rtol=1e-3, atol=1e-9)
     assert len(answers[0]) > 2
-
-
-def test_what_is_marginalised_stays_known():
-    """The last states are those of a whole graph."""
-    scene = sample_traffic(np.random.default_rng(1), frames=6)
-    whole = stepped(BatchSolver(providers(scene)), scene)
-    shorter = whole.graph().copy()
-    shorter.marginalise([key for key, one in shorter.variables.items() if one.epoch < 3])
-    assert len(shorter.variables) < len(whole.graph().variables)
-    assert apart(BatchSolver(graph=shorter), whole) < 1e-4

@@ -1,7 +1,5 @@
 """A scene as a factor graph, and parts of the model that one file adds."""
 
-import pickle
-
 import gtsam
 import numpy as np
 import pytest
@@ -9,7 +7,6 @@ import pytest
 from factors import (
     SolverSettings,
     gaussian_factor,
-    marginal_moments,
     pose_prior_factor,
     prior_factor,
 )
@@ -65,21 +62,6 @@ def driven(lag=None, frames=6, seed=2):
     return scene, smoother
 
 
-@pytest.mark.parametrize("lag", [None, 0.3])
-def test_a_pickled_graph_goes_on_as_the_smoother_itself(lag):
-    scene, smoother = driven(lag)
-    again = IncrementalSmoother(providers(scene), lag=lag)
-    again.restore(pickle.loads(pickle.dumps(smoother.snapshot())))
-    for one in (smoother, again):
-        one.step(scene.frames[-1].time)
-    assert again.graph().variables.keys() == smoother.graph().variables.keys()
-    for key, variable in smoother.graph().variables.items():
-        P = smoother.covariance(key)
-        way = variable.type.local(smoother.state(key), again.state(key))
-        assert np.abs(way / np.sqrt(np.diag(P))).max() < 2e-3
-        np.testing.assert_allclose(again.covariance(key), P, rtol=0.02, atol=1e-3 * np.abs(P).max())
-
-
 def test_relinearisation_of_a_large_component_has_the_marginals_that_one_by_one_has(monkeypatch):
     def informations(large):
         monkeypatch.setattr("saga_fg.estimators.isam2_engine._LARGE", large)
@@ -124,22 +106,6 @@ def test_the_graph_is_the_one_that_runs():
         assert np.abs(way / sigma).max() < 1e-3
 
 
-def test_covariances_are_those_of_levenberg_marquardt_in_gtsams_coordinates():
-    """Poses among them, which have moved away from their base."""
-    _, smoother = driven()
-    solution = smoother.graph().copy().solve(SolverSettings(tolerance=1e-8))
-    keys = list(smoother.graph().variables)[-6:]
-    expected = marginal_moments(solution.linear, keys, "qr")[1]
-    np.testing.assert_allclose(smoother.joint_covariance(keys), expected, rtol=1e-2, atol=1e-4 * np.abs(expected).max())
-    for key in keys:
-        (start,) = (sum(smoother.graph().variable(k).dim for k in keys[: keys.index(key)]),)
-        own = expected[start : start + smoother.graph().variable(key).dim][
-            :, start : start + smoother.graph().variable(key).dim
-        ]
-        np.testing.assert_allclose(smoother.covariance(key), own, rtol=1e-2, atol=1e-4 * np.abs(own).max())
-        np.testing.assert_allclose(solution.marginal(key), own, rtol=1e-6, atol=1e-9)
-
-
 def test_a_pose_far_from_its_base_is_where_its_factors_say():
     """Half a turn and metres off its first value: the increments' coordinates are bent there."""
     far = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.4, -0.3, 2.0), np.array([3.0, -2.0, 1.0]))
@@ -150,15 +116,6 @@ def test_a_pose_far_from_its_base_is_where_its_factors_say():
     smoother.step(0.0)
     assert smoother.state(key).equals(far, 1e-9)  # type: ignore[attr-defined]
     np.testing.assert_allclose(smoother.covariance(key), P, atol=1e-8)
-
-
-def test_a_filter_knows_its_interval_when_it_is_extended():
-    """The epoch before has left by then."""
-    smoother, later = IncrementalSmoother(lag=0.0), Once(Additions())
-    for time in (1.0, 1.5):
-        smoother.step(time)
-    smoother.extend([later])
-    assert later.asked[0].dt == 0.5
 
 
 def test_factors_under_a_name_take_each_others_place():

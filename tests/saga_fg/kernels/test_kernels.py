@@ -1,6 +1,5 @@
 """Kernels against plain NumPy. The joint Kalman filter where numbers are hard, and partitions of its state."""
 
-import pickle
 from itertools import product
 
 import numpy as np
@@ -9,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from pipelines.config import load_config
 from saga_fg.errors import InputError
 from saga_fg.estimators import JointKalmanFilter, Measurements
 from saga_fg.estimators.partition import Partition, StateLayout, flattened, regrouped, unflattened, zeros
@@ -169,21 +167,3 @@ def test_labels_by_number(labels, frozen):
 
 
 # Trackers and snapshots that went through pickle, whose arrays then lie in bytes, go on with kernels
-
-
-@pytest.mark.parametrize("protocol", [4, 5])
-def test_a_pickled_tracker_and_snapshot_go_on_alike(protocol):
-    config, frames = load_config("nuscenes"), random_frames(2)
-    tracker = config.new_tracker("saga")
-    for frame in frames[:6]:
-        tracker.step(frame)
-    copied = pickle.loads(pickle.dumps(tracker, protocol))
-    restored = config.new_tracker("saga")
-    restored.restore(pickle.loads(pickle.dumps(tracker.snapshot(), protocol)))
-    for frame in frames[6:]:
-        expected = tracker.step(frame)
-        assert len(expected)
-        for again in (copied, restored):
-            found = again.step(frame)
-            assert found.id.tolist() == expected.id.tolist()
-            np.testing.assert_allclose(found.boxes.position, expected.boxes.position, atol=1e-9)

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from saga_fg import InputError
-from saga_fg.learning import HiddenObjects, fit_interactions, hidden_objects, negative_log_likelihood
+from saga_fg.learning import HiddenObjects, fit_interactions, hidden_objects
 from saga_fg.learning.interaction_fit import RuleParameters
 from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.interactions import CarFollowing, SharedVelocity
 from saga_fg.model.motion import ConstantVelocity
-from saga_fg.model.nonlinear_interactions import IntelligentDriver
 from saga_fg.model.sensor import NoiseModel, Sensor
 from saga_fg.tracking import ClassSettings, TrackerSettings
 from tests.saga_fg.following_pairs import GAP, RATE, following_pairs
@@ -60,32 +59,6 @@ def test_a_search_can_begin_where_another_ended():
     assert again.loss < anew.loss - 1e-3, "one iteration from the template does not get there"
 
 
-def test_where_nobody_follows_rules_change_nothing():
-    scene = following_pairs(pairs=2, moments=60, seed=3, apart=500.0)
-    truth = [each.boxes.position + [[0], [0], [900.0], [900.0]] * np.array([[0, 1, 0]]) for each in scene.ground_truth]
-    truth = [
-        dataclasses.replace(each, boxes=dataclasses.replace(each.boxes, position=places))
-        for each, places in zip(scene.ground_truth, truth, strict=True)
-    ]
-    frames = [
-        dataclasses.replace(frame, detections=dataclasses.replace(frame.detections, boxes=each.boxes))
-        for frame, each in zip(scene.frames, truth, strict=True)
-    ]
-    lonely = hidden_objects(dataclasses.replace(scene, ground_truth=truth, frames=frames), SETTINGS, SENSORS, SHORT)
-    assert (lonely.neighbours < 0).all()
-    rules = fit_interactions(lonely, SETTINGS, (FOLLOW,), iterations=2).rules
-    np.testing.assert_allclose(
-        lonely.predict(SETTINGS, rules).position, lonely.predict(SETTINGS, ()).position, atol=1e-9
-    )
-
-
-def test_how_wide_the_process_noise_is_does_not_matter():
-    sample = gaps_of(1, pairs=3)
-    prediction = sample.predict(SETTINGS, (FOLLOW,))
-    wide = prediction._replace(P=4 * prediction.P + 0.03 * np.eye(2))  # with the noise of the places four times as wide
-    assert negative_log_likelihood(sample, wide) == pytest.approx(negative_log_likelihood(sample, prediction))
-
-
 def test_all_finite_rates_and_widths_of_rules_are_parameters():
     @dataclasses.dataclass(frozen=True)
     class Ahead:
@@ -108,19 +81,3 @@ def test_learning_from_nothing_is_an_error():
     sample = gaps_of(1, pairs=1)
     with pytest.raises(InputError, match="at least one object that is followed"):
         fit_interactions(HiddenObjects.pooled([sample]).select(slice(0, 0)), SETTINGS, (FOLLOW,))
-
-
-def test_the_law_of_drivers_is_learned():
-    driver = IntelligentDriver(headway=1.1, free_speed=20.0)
-    parameters = RuleParameters.from_rules((Following(driver, rate=1.0, gap_scale=math.inf),))
-    names = [name for _, name in parameters.names]
-    laws = {
-        f"interaction.{name}" for name in ("headway", "standstill_gap", "acceleration", "deceleration", "free_speed")
-    }
-    assert laws <= set(names)
-    assert "interaction.time_constant" not in names, "scales the rate alone"
-    x = parameters.start.copy()
-    x[names.index("interaction.headway")] = math.log(2.0)
-    (rule,) = parameters.valued(x)
-    assert rule.interaction.headway == pytest.approx(2.0)
-    assert rule.interaction.free_speed == pytest.approx(20.0)

@@ -48,7 +48,7 @@ from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.manoeuvres import KnownCourses, Mixture
 from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel, ScoreCalibration
 from saga_fg.tracking import ClassSettings, Tracker, TrackerSettings
-from tests.saga_fg.following_pairs import GAP, following_pairs, scene_of
+from tests.saga_fg.following_pairs import following_pairs, scene_of
 
 
 def drawn(rng, acceleration_noise, count=40, length=30, noise=0.2):
@@ -356,26 +356,6 @@ def test_the_first_step_is_that_of_a_tracker_with_the_same_settings_and_rules(sc
     assert compared >= 4
 
 
-def test_a_gap_knows_its_neighbours_and_where_the_object_reappears():
-    scene = following_pairs(pairs=2, moments=60)
-    sample = hidden_objects(scene, VELOCITY, SENSORS, ONCE)
-    tracks = sample.recorded.tracks
-    assert sample.place.shape[1:] == (3, 2)
-    assert (np.isfinite(tracks.mean[sample.start]).all(axis=1)).all()
-    for w in range(len(sample)):
-        around = sample.neighbours[w][:, 0]
-        known = around >= 0
-        apart = np.hypot(*(tracks.mean[around[known], :2] - tracks.mean[sample.start[w], :2]).T)
-        assert abs(apart[0] - GAP) < 8
-    first = int(np.flatnonzero(sample.known.all(axis=1))[0])
-    step = np.diff(np.vstack([tracks.mean[sample.start[first], :2], sample.place[first]]), axis=0)
-    assert (np.abs(step[:, 0] - 8.0 * 0.5) < 2.5).all()
-    late = ~sample.known[:, -1]
-    assert late.any(), "the recording ends within some gaps"
-    prediction = sample.predict(VELOCITY, ())
-    assert np.isfinite(prediction.position[sample.known]).all()
-
-
 def test_gaps_of_several_recordings_are_predicted_as_each_by_itself():
     parts = [hidden_objects(following_pairs(pairs=2, moments=50, seed=k), FADING, SENSORS, ONCE) for k in (0, 1)]
     together = HiddenObjects.pooled(parts).predict(FADING, (FOLLOW,))
@@ -391,13 +371,6 @@ def test_of_many_gaps_some_are_chosen_the_same_every_time():
     assert set(few.start.tolist()) <= set(sample.start.tolist())
     np.testing.assert_array_equal(sample.sampled(5, seed=1).start, few.start)
     np.testing.assert_array_equal(sample.sampled(len(sample), seed=1).start, sample.start)
-
-
-def test_no_rate_makes_a_gap_run_away():
-    sample = hidden_objects(following_pairs(pairs=2, moments=60), VELOCITY, SENSORS, ONCE)
-    stiff = Neighbours(rate=1e3, distance_scale=50.0, min_speed=0.0)
-    prediction = sample.predict(VELOCITY, (stiff,))
-    assert np.nanmax(np.abs(prediction.position - sample.place)) < 50
 
 
 def test_nothing_to_learn_from_and_nonlinear_interactions():

@@ -232,17 +232,6 @@ def blocks(row, values):
     return Blocks(np.array([row]), np.array([row]), np.asarray(values, dtype=float)[None])
 
 
-def test_blocks_are_where_their_nodes_are():
-    assert TRANSITION.nodes.tolist() == [4, 9, 2]
-    assert TRANSITION.offsets.tolist() == [0, 4, 10, 12]
-    F = TRANSITION.F_matrix.toarray()
-    assert F.shape == (12, 12)
-    assert F[0, 2] == 0.5
-    assert F[4, 8] == pytest.approx(0.125)
-    assert np.array_equal(F[10:, 10:], np.eye(2))
-    assert TRANSITION.Q_matrix.toarray()[10:, 10:] == pytest.approx(0.01 * np.eye(2))
-
-
 def test_parts_that_do_not_fit_are_refused(subtests):
     for parts, message in [
         ({"b": np.zeros(11)}, r"transition over 0.5 s: b: expected 12 entries, got shape \(11,\)"),

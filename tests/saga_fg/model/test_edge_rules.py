@@ -14,7 +14,7 @@ from saga_fg.model.edge_rules import SPREAD, UNSEEN_ACCELERATION, Following, Nei
 from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import SHARP, CarFollowing, Paths, SharedVelocity
 from saga_fg.model.nonlinear_interactions import IntelligentDriver, SmoothDriver
-from saga_fg.numerics.geometry import Polylines, yaw_transform
+from saga_fg.numerics.geometry import Polylines
 from tests.saga_fg.model.drawn_traffic import bend, edges, joined, leaders, random_traffic, straight, table, with_path
 
 seeds = st.integers(0, 2**32 - 1)
@@ -64,17 +64,6 @@ def test_leaders_are_the_nearest_that_exist_and_clutter_pulls_at_nobody():
     assert sum(rates[3].values()) == pytest.approx(rule.rate * (1 - 0.1 * 0.4 * 0.8))
 
 
-@given(seeds)
-def test_certain_nodes_have_the_edges_of_nodes_of_which_no_existence_is_known(seed):
-    nodes = random_traffic(np.random.default_rng(seed))
-    rules = [Following(), Neighbours()]
-    plain, certain = build_graph(nodes, rules), build_graph(replace(nodes, existence=np.ones(len(nodes))), rules)
-    for one, other in zip(plain.edges, certain.edges, strict=True):
-        assert np.array_equal(one.target, other.target)
-        assert np.array_equal(one.source, other.source)
-        assert one.rate == pytest.approx(other.rate)
-
-
 def test_a_target_that_perhaps_moves_follows_at_the_expected_rate():
     nodes = table(*straight(2))
     full = Following(leaders="moving").pairs(nodes).rate[0]
@@ -113,12 +102,6 @@ def test_in_a_straight_queue_each_follows_the_one_ahead(heading):
     pairs = Following().pairs(table(*straight(6, heading=heading)))
     assert leaders(pairs) == {k: k - 1 for k in range(1, 6)}
     assert pairs.rate == pytest.approx(np.exp(-12.0 / 20.0))
-
-
-@pytest.mark.parametrize("radius", [30.0, -30.0, 60.0, -200.0])
-def test_in_a_bend_too(radius):
-    nodes = table(*bend(6, radius, gap=10.0))
-    assert leaders(Following().pairs(nodes)) == {k: k - 1 for k in range(1, 6)}
 
 
 @pytest.mark.parametrize(
@@ -192,18 +175,6 @@ def test_at_most_the_strongest_edges_are_kept(seed, degree):
         assert kept.get(target, {}).items() <= sources.items()
 
 
-@given(seeds, st.floats(-7, 7), st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)))
-def test_rules_know_no_place_and_no_direction(seed, turn, shift):
-    nodes = random_traffic(np.random.default_rng(seed), 12)
-    R = yaw_transform(yaw=turn)[:2, :2]
-    there = table(nodes.position @ R.T + np.array(shift), nodes.heading + turn, np.hypot(*nodes.velocity.T))
-    for rule in (Neighbours(), Following()):
-        here, moved = edges(rule.pairs(nodes)), edges(rule.pairs(there))
-        assert here.keys() == moved.keys()
-        for target, sources in here.items():
-            assert moved[target] == {j: pytest.approx(rate, rel=1e-6) for j, rate in sources.items()}
-
-
 def test_who_leads_may_be_those_that_move_or_those_that_stand():
     """Before a car stands a parked one, and before that drives another."""
     nodes = table(*straight(3))
@@ -214,22 +185,6 @@ def test_who_leads_may_be_those_that_move_or_those_that_stand():
     assert leaders(Following(leaders="stationary").pairs(nodes)) == {2: 1}
     with pytest.raises(InputError, match="leaders: expected one of any, moving, stationary"):
         Following(leaders="parked")
-
-
-@pytest.mark.parametrize("exists", [1.0, 0.4])
-@pytest.mark.parametrize("leading", ["moving", "stationary"])
-def test_rates_are_continuous_in_whether_a_vehicle_between_moves(leading, exists):
-    nodes, rule = replace(table(*straight(3)), existence=np.array([1.0, exists, 1.0])), Following(leaders=leading)
-
-    def led(moved):
-        there = np.array([leading == "moving", moved, True], dtype=float)
-        found = edges(rule.pairs(replace(nodes, has_moved=there))).get(2, {})
-        return [found.get(source, 0.0) for source in (0, 1)]
-
-    certain = 0.0 if leading == "moving" else 1.0
-    assert led(certain) == pytest.approx(led(abs(certain - 1e-9)), abs=1e-8)
-    assert led(certain)[0] == pytest.approx(led(1 - certain)[0]), "who leads from beyond depends on its existence alone"
-    assert (led(certain)[0] == 0) == (exists == 1)
 
 
 # From edge rules, shipped and of users, to a graph
@@ -312,15 +267,6 @@ def test_what_interactions_explain_is_noise_no_more():
     assert (build_graph(nodes, (Ring(rate=1e6),), explained_noise=1e6).diffusion_scale > 0).all()
 
 
-@pytest.mark.parametrize("n", [0, 1])
-def test_too_few_nodes_for_an_edge(n):
-    nodes = table(*straight(n))
-    for rule in (Following(), Neighbours()):
-        assert len(rule.pairs(nodes).target) == 0
-    graph = build_graph(nodes, (Following(), Neighbours(), Ring()))
-    assert (len(graph), graph.edge_count) == (n, 0)
-
-
 def test_types_may_be_equal_and_rules_return_lists():
     again = NodeType("car", ConstantVelocity(acceleration_noise=1.5))
     graph = build_graph(table(*straight(3), types=(CAR, again, CAR)), (Following(),))
@@ -355,18 +301,6 @@ def test_the_leader_is_the_nearest_on_the_path_that_is_predicted():
     rule = Following(SharedVelocity(), gap_scale=np.inf)
     assert leaders(rule.pairs(nodes)) == {0: 2}
     assert leaders(rule.pairs(with_path(nodes, 0, places, headings))) == {0: 1}
-
-
-def test_a_straight_path_is_no_path():
-    rng = np.random.default_rng(3)
-    for _ in range(10):
-        nodes = random_traffic(rng)
-        nodes = replace(nodes, heading=np.zeros(len(nodes)))
-        on = nodes.position[4] + np.arange(0.0, 60.0, 3.0)[:, None] * np.array([1.0, 0.0])
-        rule = Following(SharedVelocity())
-        assert edges(rule.pairs(nodes)).get(4, {}) == pytest.approx(
-            edges(rule.pairs(with_path(nodes, 4, on, np.zeros(20)))).get(4, {})
-        )
 
 
 @pytest.mark.parametrize("law", [CarFollowing(time_constant=2.0, headway=1.0), IntelligentDriver(headway=1.0)])

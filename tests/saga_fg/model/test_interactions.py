@@ -7,16 +7,12 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from factors import Vector
-from factors.manifolds import central_differences
 from saga_fg import InputError
-from saga_fg.conformance.programs import BUS, CONE, MOVING, POLE, node_table
+from saga_fg.conformance.programs import BUS, MOVING, node_table
 from saga_fg.model import nonlinear_interactions
-from saga_fg.model.discretisation import discretise
 from saga_fg.model.edge_rules import Following
-from saga_fg.model.graph_building import build_graph, require_stable
-from saga_fg.model.interactions import CarFollowing, SharedVelocity, applies
-from saga_fg.model.map_rules import DriverStopping, RedLight
+from saga_fg.model.graph_building import require_stable
+from saga_fg.model.interactions import CarFollowing, SharedVelocity
 from saga_fg.model.nonlinear_interactions import (
     HIDDEN_VEHICLE_GAP,
     MAX_DECELERATION,
@@ -27,7 +23,7 @@ from saga_fg.model.nonlinear_interactions import (
     smooth_acceleration,
 )
 from saga_fg.numerics.geometry import yaw_transform
-from tests.saga_fg.road_scenes import queue, table
+from tests.saga_fg.road_scenes import table
 from tests.saga_fg.sampled_traffic import Interaction
 
 seeds = st.integers(0, 2**32 - 1)
@@ -58,12 +54,6 @@ def acceleration(interaction, nodes, i, j, p_i, v_i, p_j, v_j):
 def two_nodes(rng, types):
     nodes = node_table(rng, types)
     return nodes, np.array([0]), np.array([1])
-
-
-def state(node_type, p, v):
-    x = np.zeros(node_type.dim)
-    x[node_type.index(("x", "y"))], x[node_type.index(("vx", "vy"))] = p, v
-    return x
 
 
 @pytest.mark.parametrize("interaction", INTERACTIONS, ids=repr)
@@ -103,16 +93,6 @@ def test_many_edges_are_the_edges_one_by_one():
                 assert np.array_equal(a[k], b[0])
 
 
-def test_interactions_say_which_types_they_act_on():
-    for interaction in INTERACTIONS:
-        assert all(applies(interaction.needs, a, b) for a in MOVING for b in MOVING)  # type: ignore[attr-defined]
-        assert not any(
-            applies(interaction.needs, a, b) or applies(interaction.needs, b, a)  # type: ignore[attr-defined]
-            for a in MOVING
-            for b in (CONE, POLE)  # type: ignore[attr-defined]
-        )
-
-
 # Interaction functions of the running graph: what drivers and pedestrians do
 
 
@@ -138,40 +118,7 @@ def test_gaps_close_up_to_what_is_wanted_and_nobody_drives_backwards():
     assert value(DRIVER.following, 0, 5.0, 2.0) > 0.5
 
 
-def test_pedestrians_push_each_other_away_and_stacks_are_the_same():
-    law, rng = Interaction(SocialForce()), np.random.default_rng(0)
-    x, others = rng.normal(size=(5, 4)), [rng.normal(size=(5, 4)) for _ in range(2)]
-    together = law.predict(x, others, 0.2)
-    for k in range(5):
-        np.testing.assert_allclose(law.predict(x[k], [other[k] for other in others], 0.2), together[k])
-    here, there = np.zeros(4), np.array([0.5, 0.0, 0.0, 0.0])
-    assert law.predict(here, [there], 0.1)[2] < 0 < law.predict(there, [here], 0.1)[2]
-    assert np.isfinite(law.predict(here, [here], 0.1)).all()
-    assert law.predict(here, [], 0.1).tolist() == here.tolist()
-
-
 PIECES = np.array([[-5.0, 0.0, 0.0, 1.0], [0.0, 1.0, 4.0, 0.0]])  # a wall with a corner
-GIVEN = {
-    "driver": (SmoothDriver(), np.array(4.0)),
-    "standing": (SmoothDriver(IntelligentDriver(headway=0.5)), np.array(9.0)),
-    "wall": (SocialForce(), PIECES),
-}
-
-
-@pytest.mark.parametrize("name", GIVEN)
-def test_accelerations_and_their_derivatives(name):
-    """Beside a wall, past its ends, behind its corner; next to a leader."""
-    (law, given), rng = GIVEN[name], np.random.default_rng(2)
-    own, other = 4 * rng.normal(size=(40, 4)), rng.normal(size=(40, 4))
-    stacked = np.broadcast_to(given, (40, *given.shape))
-    _, by_own, by_other = law.accelerations(own, other, stacked)  # type: ignore[attr-defined]
-    expected = central_differences(
-        lambda a, b: law.accelerations(a, b, stacked).value,  # type: ignore[attr-defined]
-        [own, other],
-        [Vector(4)] * 2,
-    )
-    np.testing.assert_allclose(by_own, expected[0], atol=1e-6 * max(1.0, np.abs(by_own).max()))
-    np.testing.assert_allclose(by_other, expected[1], atol=1e-6 * max(1.0, np.abs(by_own).max()))
 
 
 def test_a_wall_pushes_along_its_normal_and_from_its_end(monkeypatch):
@@ -226,27 +173,6 @@ def test_nobody_speeds_up_into_a_gap_with_room_for_another(v, w, s):
     assert value(DRIVER.stopping, v, s) <= 0
     close = HIDDEN_VEHICLE_GAP - 0.1
     assert value(DRIVER.following, v, close, w) == value(DRIVER.alone, v, close, w)
-
-
-def test_a_queue_comes_to_a_halt_before_the_line():
-    """Step by step along the graph, as in a prediction: all stand at last, in order, none beyond the line."""
-    rules = [
-        RedLight(interaction=DriverStopping(driver=DRIVER), reaction_deceleration=0.0, full_deceleration=1e-3),
-        Following(interaction=DRIVER, gap_scale=math.inf, max_gap=80.0, parked=True),
-    ]
-    nodes = queue()
-    state = np.concatenate([np.concatenate([nodes.position, nodes.velocity], axis=1)[:4].ravel(), nodes.position[4]])
-    for _ in range(120):
-        moving = state[:16].reshape(4, 4)
-        rows = [("car", *x[:2], x[2], 0.0, 4) for x in moving] + [("stop_line", 0, 1.75, 0, 0, 0)]
-        now = table(rows, np.array([0, 0, 0, 0, 1.0]), nodes.outline)
-        step = discretise(build_graph(now, rules), 0.25)
-        state = step.F_matrix @ state + step.b
-    x, v = state[:16].reshape(4, 4)[:, 0], state[:16].reshape(4, 4)[:, 2]
-    assert np.all(np.abs(v) < 0.1)
-    assert -6 < x[0] + 2 < -1
-    assert np.all((x[:2] - x[1:3] - 4 > 1) & (x[:2] - x[1:3] - 4 < 5))
-    assert -6 < x[3] + 2 < -1
 
 
 def test_neither_its_double_nor_a_trailer_counts_as_led():

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 import pytest
 import scipy.linalg
@@ -24,7 +23,6 @@ from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.manoeuvres import CoordinatedTurn
 from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce
 from saga_fg.model.scene_graph import NonlinearEdges
-from tests.saga_fg.graph_keys import keys_of
 
 
 @dataclass(frozen=True)
@@ -116,23 +114,6 @@ def scene():
     return SceneGraph(NODES, TYPES, (shared,), nonlinear=(followers, apart, wall))
 
 
-def driven(estimator, frames=6, dt=0.2):
-    rng, graph = np.random.default_rng(0), scene()
-    for node, x in zip(NODES.tolist(), START, strict=True):
-        x = np.array(x) + 0.1 * rng.normal(size=len(x)) * np.array([1, 1, 1, 1, 0.2])[: len(x)]
-        estimator.add([node], [x], [np.diag([1.0, 1.0, 1.0, 1.0, 0.04][: len(x)])])
-    for k in range(frames):
-        estimator.predict(discretise(graph, dt))
-        for d in (5, 4, 2):
-            seen = np.array([n for n, x in zip(NODES.tolist(), START, strict=True) if len(x) == d and n != 12 + k % 3])
-            if len(seen):
-                z = np.array([START[n - 10][:2] for n in seen]) + rng.normal(0, 0.2, (len(seen), 2))
-                if d > 2:
-                    z += (k + 1) * dt * np.array([START[n - 10][2:4] for n in seen])
-                estimator.update(Measurements(seen, z, np.eye(2, d), 0.04 * np.eye(2)))
-    return estimator
-
-
 def difference(a, b):
     """Largest of means, in sigmas, and of covariances, relative."""
     P = b.joint_covariance(NODES)
@@ -149,21 +130,6 @@ def test_the_first_linearisation_of_smoothers_is_the_filters(name):
             estimator.add([node], [x], [np.diag([1.0, 1.0, 1.0, 1.0, 0.04][: len(x)])])
         estimator.predict(discretise(scene(), 0.3))
     assert difference(*estimators) < 1e-9
-
-
-def test_smoothers_reach_the_minimum_of_the_graph():
-    """The window, and Levenberg-Marquardt of GTSAM on the exported graph, from the window's answer."""
-    smoother = driven(GraphFilter(lag=100.0))
-    exported = smoother.graph()
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-14)
-    parameters.setAbsoluteErrorTol(1e-14)
-    solved = gtsam.LevenbergMarquardtOptimizer(exported.native(), exported.values, parameters).optimize()
-    for epoch, moment in enumerate(smoother.smoothed()):
-        for node, key in keys_of(exported, epoch).items():
-            sigma = np.sqrt(np.diag(moment.covariance([node])[0]))
-            assert np.abs((moment.mean([node])[0] - solved.atVector(key)) / sigma).max() < 1e-3
-    assert difference(driven(JointKalmanFilter()), smoother) > 1e-4  # the filter does not look back
 
 
 def test_late_measurements_split_the_interval_with_its_laws():

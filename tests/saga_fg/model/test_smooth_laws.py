@@ -29,7 +29,7 @@ from saga_fg.model.edge_rules import Following, Neighbours
 from saga_fg.model.graph_building import LearnedInteractions, build_graph, highest_rate, require_stable
 from saga_fg.model.interactions import CarFollowing, NodeTable, SharedVelocity, velocity_triples
 from saga_fg.model.motion import ConstantVelocity, NodeType
-from saga_fg.model.nonlinear_interactions import FALLOFF, RADII, STRENGTH, SmoothDriver, SocialForce
+from saga_fg.model.nonlinear_interactions import SmoothDriver, SocialForce
 from saga_fg.tracking import TrackerSettings
 
 DISTANCES = np.array([0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-3, 0.1, 0.3, 1.0, 5.0])  # m
@@ -251,20 +251,6 @@ def test_distances_are_exact_beyond_their_width_and_walls_however_cut():
     np.testing.assert_allclose(one.value, two.value, atol=0.04)
 
 
-def test_repulsion_is_the_gradient_of_its_potential():
-    force, rng = SocialForce(), np.random.default_rng(5)
-    p = np.concatenate([0.2 * rng.normal(size=(40, 2)), rng.normal(size=(40, 2)), np.zeros((1, 2))])
-    own = np.concatenate([p, np.zeros_like(p)], axis=1)
-
-    def potential(x: np.ndarray) -> np.ndarray:
-        r = soft_distance(x, 0.3).value
-        return STRENGTH * FALLOFF * np.exp((RADII - r) / FALLOFF)[:, None]
-
-    downhill = -central_differences(potential, [p], [Vector(2)])[0][:, 0]
-    value = force.accelerations(own, np.zeros_like(own), np.broadcast_to(force.alone, (len(p), 1, 4))).value
-    np.testing.assert_allclose(value, downhill, atol=1e-8)
-
-
 # Edge rules that would drive objects apart are refused, alone and together
 
 CONVOY = CarFollowing(time_constant=1.0)
@@ -354,14 +340,3 @@ def test_dynamics_that_run_away_are_refused():
 
     with pytest.raises(InputError, match=r"edges\[0\]: expected stable dynamics"):
         LearnedInteractions(edges=(Neighbours(Flight(), rate=1.0),))
-
-
-@settings(max_examples=30)
-@given(
-    st.floats(0.001, 20),
-    st.sampled_from([SharedVelocity(), SharedVelocity(True)]),
-    st.floats(0.5, 1e3) | st.just(math.inf),
-)
-def test_shipped_interactions_are_stable_at_every_rate(rate, interaction, tau):
-    for rule in (Neighbours(interaction, rate=rate), Following(CarFollowing(tau), rate=rate)):
-        LearnedInteractions(edges=(rule,))

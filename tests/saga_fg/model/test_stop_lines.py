@@ -13,7 +13,7 @@ from saga_fg.model.edge_rules import CLEARANCE, OFFSET_TIME, Attached, Following
 from saga_fg.model.graph_building import build_graph
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.map_rules import CONE_RATE, PREVIEW, ConeLine, GreenLight, InLane, RedLight, Stopping
-from saga_fg.numerics.geometry import direction_at, feet
+from saga_fg.numerics.geometry import feet
 from saga_fg.types.road_map import (
     STATES,
     Lane,
@@ -185,20 +185,6 @@ def test_where_a_lane_ends_vehicles_go_straight_on_to_the_line():
         assert RedLight().pairs(replace(nodes, lanes=across)).target.tolist() == [0]
 
 
-def test_the_queue_brakes_through_following():
-    """The second car has no edge to the line; it slows down because the first one does."""
-    nodes = queue()
-    rules = [RedLight(), Following(interaction=SharedVelocity(), rate=1.0)]
-    ends = [
-        (edges.interaction, target, source)
-        for edges in build_graph(nodes, rules).edges
-        for target, source in zip(edges.target.tolist(), edges.source.tolist(), strict=True)
-    ]
-    assert ("Stopping", 0, 4) in ends
-    assert ("SharedVelocity", 1, 0) in ends
-    assert not any(name == "Stopping" and t in (1, 2) for name, t, _ in ends)
-
-
 def line_round_the_bend(*others):
     """Vehicles `others`, one in a bent lane, the lane, and a stop line that it would miss straight on."""
     nodes, n = bent_lane(), len(others)
@@ -245,18 +231,6 @@ def test_who_takes_no_part_changes_nothing_for_others():
 
 
 # lanes
-
-
-def test_feet_and_directions_of_an_arc():
-    angle = np.linspace(0, 1.5, 200)
-    arc = 20 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=-1)
-    places = np.array([[20 * np.sin(a) * k, 20 - 20 * np.cos(a) * k] for a, k in ((0.5, 0.9), (1.0, 1.1))])
-    found = feet(arc, places)
-    assert np.allclose(found.s, [10, 20], atol=0.01)
-    assert np.allclose(found.e, [2, -2], atol=0.01)
-    assert np.allclose(direction_at(arc, np.array([10.0])), [[np.cos(0.5), np.sin(0.5)]], atol=1e-3)
-    beyond = feet(arc, np.array([[-5.0, 0.3]]))
-    assert beyond.s[0] == pytest.approx(-5, abs=0.02)
 
 
 def test_a_vehicle_turns_with_its_lane():

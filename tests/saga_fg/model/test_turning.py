@@ -156,16 +156,6 @@ def test_braking_ends_at_standstill(heading):
         assert (F @ x + b)[A] @ u == pytest.approx((F @ x)[A] @ u if brakes_on else 0.0)
 
 
-@pytest.mark.parametrize("mean", [(0, 0, 8, 0, 0, 0), (0, 0, 0.2, 0, -3, 0)])
-def test_two_half_steps_turn_as_one(mean):
-    graph, dt = along(course(CAR, rate=0.4, mean=mean)), 0.4
-    first, second = discretise(graph, dt / 2), discretise(graph.after(dt / 2), dt / 2)
-    whole = discretise(graph, dt)
-    assert whole.F_matrix.toarray()[V, V] == pytest.approx((second.F_matrix @ first.F_matrix).toarray()[V, V], abs=1e-9)
-    assert whole.F_matrix.toarray() == pytest.approx((second.F_matrix @ first.F_matrix).toarray(), abs=1e-2)
-    assert whole.b == pytest.approx(second.F_matrix @ first.b + second.b, abs=2e-2)
-
-
 def test_edges_act_on_the_velocity_of_turning_nodes():
     """An edge that takes over the neighbour's velocity at once leaves nothing of the node's own."""
     nodes = node_table(np.random.default_rng(0), (CAR, CAR), ids=[7, 8])

@@ -155,15 +155,6 @@ def test_trees_of_ties_count_every_edge_once_and_independent_tracks_none():
     assert len(QuadraticMatching(none, none, np.empty(0), PairCosts(none, none, np.empty(0))).solve()) == 0
 
 
-@pytest.mark.parametrize("n", [3, 5])
-def test_of_objects_that_move_as_one_the_weights_add_up_to_a_tree(n):
-    P = np.kron(np.ones((n, n)), 4.0 * np.eye(2)) + 0.1 * np.eye(2 * n)
-    S = np.tile(4.2 * np.eye(2), (n, 1, 1))
-    _, weight = weights(P, S)
-    np.testing.assert_allclose(weight, 2 / n)
-    assert weight.sum() == pytest.approx(n - 1)
-
-
 def test_a_detection_is_not_paired_with_itself_and_pairs_are_named_once():
     P, R, _ = drawn(4, n=2)
     track, detection = np.array([0, 1, 1, 0]), np.array([5, 5, 6, 6])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from saga_fg import ConstantVelocity, Detection, Detections, Frame, InputError, Sensor, Tracker, TrackerSettings
-from saga_fg.estimators import BatchSolver, IncrementalSmoother
+from saga_fg.estimators import IncrementalSmoother
 from saga_fg.graph import (
     EGO_BIAS,
     EGO_POSE,
@@ -66,7 +66,7 @@ def test_odometry_gps_and_landmarks_err_as_they_say(planar):
         rng = np.random.default_rng(seed)
         smoother = IncrementalSmoother([Odometry(start), Gps(gate=1), Landmarks()])
         pose = drawn(rng, first(planar, start), np.diag(P))
-        for k in range(25):
+        for k in range(15):
             odometry = None
             if k:
                 pose = pose.compose(step)
@@ -78,29 +78,7 @@ def test_odometry_gps_and_landmarks_err_as_they_say(planar):
         place_scores.append(nees(smoother, smoother.graph().of(LANDMARK, None)[3].key, post))
     assert 0.4 < np.mean(scores) < 1.7, scores
     assert 0.3 < np.mean(place_scores) < 2.2, place_scores
-    assert [str(one) for one in smoother.graph().variables.values()] == ["point 3", "vehicle 0 at 2.40 s"]
-
-
-def test_a_recording_solved_as_a_whole_takes_them_as_well():
-    start = StartSettings(START, 0.5, 0.1, 0.03, planar=True)
-    C, step, rng = np.diag([0.0025, 0.0009, 0.0001]), gtsam.Pose2(1.0, 0.0, 0.05), np.random.default_rng(0)
-    online, batch = (
-        make([Odometry(start), Gps()]) for make in (lambda own: IncrementalSmoother(own, None), BatchSolver)
-    )
-    pose = first(True, start)
-    for k in range(8):
-        pose = pose.compose(step) if k else pose
-        odometry = OdometryIncrement(drawn(rng, step, C).matrix(), DT, C) if k else None
-        heard = frame(
-            k, EgoMeasurements(odometry, GpsFix(pose.translation() + rng.normal(0, 0.3, 2), 0.09 * np.eye(2)))
-        )
-        for estimator in (online, batch):
-            estimator.step(DT * k, frame=heard)
-    keys = [key for key, one in online.graph().variables.items() if one.kind == EGO_POSE]
-    assert len(keys) == 8
-    for key in keys:
-        way = batch.graph().variable(key).type.local(online.state(key), batch.state(key))
-        assert np.abs(way / np.sqrt(np.diag(batch.covariance(key)))).max() < 1e-3
+    assert [str(one) for one in smoother.graph().variables.values()] == ["point 3", "vehicle 0 at 1.40 s"]
 
 
 def test_inertial_samples_find_velocity_and_biases():

@@ -8,10 +8,9 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import SolverSettings, pose_prior_factor
+from factors import SolverSettings
 from saga_fg import Detections, Frame, InputError
 from saga_fg.estimators.solvers import BatchSolver
-from saga_fg.graph import EGO_POSE, Additions, GraphView
 from saga_fg.model import PlaneLandmark, PoleLandmark
 from saga_fg.numerics import inverse_transform, yaw_transform
 from saga_fg.providers.vehicle_sensors import Gps
@@ -110,17 +109,6 @@ def test_while_running_submaps_say_nearly_what_their_measurements_do():
     np.testing.assert_allclose(graph.covariance(), found.covariances[-1], rtol=0.05, atol=3e-6)
 
 
-def test_one_submap_is_the_whole_graph_at_every_moment():
-    drive = Drive(square(27))
-    settings = SubmapSettings(length=100.0, confirm_after=1, relinearise_above=1e-4)
-    graph = started(drive, settings)
-    for k in range(27):
-        drive.into(graph, range(k, k + 1))
-        if k % 13 == 0:
-            found = graph.finish()
-            assert sigmas(graph.poses(), found.world_T_pose, found.covariances).max() < 1e-3
-
-
 def test_a_graph_stays_small_and_landmarks_keep_their_numbers():
     drive = Drive(square(200))
     graph = started(drive, SubmapSettings(length=10.0))
@@ -217,26 +205,6 @@ def test_fixes_of_gps_hold_through_closed_submaps():
     )  # the others hear of the running submap when it is closed
 
 
-class Held:
-    """A user's provider: knows one pose very well."""
-
-    name = "survey"
-
-    def factors(self, view: GraphView) -> Additions:
-        if view.epoch != 50:
-            return Additions()
-        pose = view.now(EGO_POSE)[0]
-        return Additions(factors=[pose_prior_factor(pose.key, yaw_transform(20.0, 5.0), 1e-6 * np.eye(6))])
-
-
-def test_a_provider_acts_at_once_and_at_the_end():
-    drive = Drive(square(80), 0, POOR, landmarks=False)
-    graph = started(drive, SubmapSettings(length=15.0), [Held()])
-    drive.into(graph, range(80))
-    for poses in (graph.poses(), graph.finish().world_T_pose):
-        assert np.linalg.norm(poses[50, :2, 3] - [20.0, 5.0]) < 0.1
-
-
 def test_a_keyframe_that_is_refused_leaves_the_graph_as_it_was():
     drive = Drive(square(6))
     graph = started(drive)
@@ -253,11 +221,9 @@ def test_a_keyframe_that_is_refused_leaves_the_graph_as_it_was():
         started(drive).finish()
 
 
-def looping(Q: np.ndarray = POOR, turn: float = 0.0) -> tuple[Drive, SubmapGraph, list[LoopClosure]]:
-    """Nearly twice round a block, with a true loop at every submap of the second round; odometry turns too much, rad
-    a step."""
-    drive, rng = Drive(square(500), 3, Q, landmarks=False), np.random.default_rng(0)
-    drive.motions[1:] = [(moved[0] @ yaw_transform(0.0, yaw=turn), moved[1]) for moved in drive.motions[1:]]
+def looping() -> tuple[SubmapGraph, list[LoopClosure]]:
+    """Nearly twice round a block, with a true loop at every submap of the second round."""
+    drive, rng = Drive(square(500), 3, POOR, landmarks=False), np.random.default_rng(0)
     graph, loops = started(drive, SubmapSettings(length=15.0)), []
     R = np.diag([1e-3] * 3 + [0.02] * 3) ** 2
     for k in range(500):
@@ -270,11 +236,11 @@ def looping(Q: np.ndarray = POOR, turn: float = 0.0) -> tuple[Drive, SubmapGraph
             seen = gtsam.Pose3(true).retract(rng.normal(size=6) * np.sqrt(np.diag(R))).matrix()
             loops.append(LoopClosure(first, number, seen, R, confirmed=True))
             graph.close_loops(loops[-1:])
-    return drive, graph, loops
+    return graph, loops
 
 
 def test_a_false_loop_does_not_bend_the_map():
-    _, graph, loops = looping()
+    graph, loops = looping()
     assert len(loops) >= 4
     clean = graph.finish()
     assert clean.loops.kept.all()
@@ -283,12 +249,3 @@ def test_a_false_loop_does_not_bend_the_map():
     spoilt = graph.finish()
     np.testing.assert_array_equal(spoilt.loops.kept, [True] * len(loops) + [False])
     np.testing.assert_allclose(spoilt.world_T_pose, clean.world_T_pose, atol=0.02)
-
-
-def test_drift_beyond_the_noise_does_not_cost_loops():
-    drive, graph, _ = looping(Q, turn=1e-3)  # twice its deviation, always in one direction
-    found = graph.finish()
-    assert found.loops.kept.all()
-    assert found.loops.inflation[0] > 2.0 > found.loops.inflation[1]
-    off = np.linalg.norm(found.world_T_pose[:, :3, 3] - drive.poses[:, :3, 3], axis=1)
-    assert off.max() < 1.0

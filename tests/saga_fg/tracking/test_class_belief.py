@@ -166,13 +166,6 @@ def test_sensors_that_disagree_make_one_track_of_the_likelier_class(estimator):
     assert track.classes_of(reported[-1].id).tolist() == ["truck"]
 
 
-def test_without_tables_there_are_two():
-    track = tracker(sensors={})
-    for k in range(4):
-        reported = track.step(frame(0.1 * k, (("car", "truck")[k % 2], 20.0)))
-    assert sorted(reported.boxes.label.tolist()) == ["car", "truck"]
-
-
 @pytest.mark.parametrize(
     ("other", "place", "edges", "left"),
     [
@@ -208,17 +201,6 @@ def test_groups_keep_to_themselves_and_ones_own_class_goes_before_a_nearer_other
     at = dict(zip(later.boxes.label.tolist(), later.boxes.position[:, 0].tolist(), strict=True))
     assert at["car"] < at["truck"]
     assert set(later.id.tolist()) <= set(first.id.tolist())
-
-
-def test_an_object_that_returns_as_another_class_is_the_same():
-    track = tracker(default=ClassSettings(initial_speed_deviation=0.1, max_deviation=5.0))
-    for k in range(6):
-        before = track.step(frame(0.1 * k, ("car", 20.0)))
-    for k in range(6, 14):
-        track.step(frame(0.1 * k))
-    after = track.step(frame(1.4, ("truck", 21.0)))
-    assert after.id.tolist() == before.id.tolist()
-    assert after.boxes.label.tolist() == ["car"]
 
 
 def test_a_table_without_the_class_itself_is_refused(subtests):

@@ -54,7 +54,7 @@ FAULTS = {
 
 
 def test_majorities_and_steadiness_say_which_clock_is_right(subtests):
-    for (name, fault), radar, wrong in product(FAULTS.items(), [5.0, 15.0, 20.0], ["radar", "lidar"]):
+    for (name, fault), radar, wrong in product(FAULTS.items(), [5.0, 20.0], ["radar", "lidar"]):
         with subtests.test(name, radar=radar, wrong=wrong):
             used, verdicts = shares({**RATES, "radar": radar}, wrong, fault)
             assert min(used.values()) >= 0.99
@@ -165,7 +165,7 @@ def tracked(wrong, offset, end=6.0, tracker=None, begin=0.0, sensors=("lidar", "
 
 
 def test_a_steady_offset_is_found_and_corrected(subtests):
-    for wrong, offset in [("radar", 0.05), ("radar", -0.3), ("lidar", 0.5), ("lidar", -2.0), ("radar", 3600.0)]:
+    for wrong, offset in [("radar", 0.05), ("lidar", -2.0), ("radar", 3600.0)]:
         with subtests.test(wrong=wrong, offset=offset):
             tracker, used = tracked(wrong, offset)
             clocks = tracker.sensor_times

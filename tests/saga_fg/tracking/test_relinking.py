@@ -11,7 +11,7 @@ from saga_fg.numerics.geometry import yaw_transform
 from saga_fg.tracking import AssociationSettings, ClassSettings
 from saga_fg.tracking.journal import Journal
 from saga_fg.tracking.relinking import relinkable
-from tests.saga_fg.traffic_frames import assert_estimators_agree, assert_same, columns, frame, run
+from tests.saga_fg.traffic_frames import frame, run
 
 SETTINGS = TrackerSettings(
     {"default": ClassSettings(ConstantVelocity(acceleration_noise=0.5), max_deviation=1.0, max_distance=3.0)},
@@ -104,21 +104,6 @@ def test_among_many_detections_only_a_well_known_place_tells():
         assert (tracks.id[nearest] == 1) == same
 
 
-def test_estimators_agree():
-    frames = [frame(0.1 * k, [VAN, *([crossing(0.1 * k)] if not 30 <= k < 65 else [])]) for k in range(80)]
-    assert assert_estimators_agree(SETTINGS, None, frames, 1e-6)[-1].id.tolist() == [1, 2]
-
-
-def test_a_relinked_track_is_updated_as_any_other():
-    """A tracker that assigns the return at once, as its gate is wide, has the same state."""
-    wide = replace(SETTINGS, classes={"default": replace(SETTINGS.classes["default"], max_deviation=20.0)})
-    everything = replace(wide, association=AssociationSettings(relink_above=1.0))
-    frames = [frame(0.1 * k, [crossing(0.1 * k)] if not 30 <= k < 65 else []) for k in range(66)]
-    relinked, assigned = run(Tracker(SETTINGS), frames)[-1], run(Tracker(everything), frames)[-1]
-    assert columns(relinked)["position"] == columns(assigned)["position"]
-    assert relinked.id.tolist() == assigned.id.tolist() == [1]
-
-
 # A return that began with a doubtful detection gets its old identity; others don't take it
 
 
@@ -208,10 +193,3 @@ def test_the_journal_tells_of_it(providers):
     run(tracker, [frame(t, [beside(t)], yaw=np.pi / 2, world_T_ego=EGO) for t in (6.7, 6.8)])
     (event,) = [one for one in events if one["event"] == "deleted" and one["track"] == 2]
     assert event["reason"] == "it is the return of an earlier track"
-
-
-@pytest.mark.parametrize("estimator", ["isam2", "fixed-lag"])
-def test_estimators_agree_on_who_is_handed_over(estimator):
-    expected = handed_returning(beside)[1]
-    found = handed_returning(beside, settings=replace(SETTINGS, estimator=estimator))[1]
-    assert_same(expected, found, 1e-6)

@@ -1,6 +1,5 @@
 """Tracks end when they can't be found again."""
 
-import numpy as np
 import pytest
 
 from saga_fg import ConstantVelocity, Tracker, TrackerSettings
@@ -55,12 +54,3 @@ def test_a_follower_of_a_leader_in_view_is_kept_and_reported_for_longer_than_a_c
         assert max(variance.max(initial=0.0) for variance in told) <= 1.5**2
     assert 1.0 < ends[0] < 1.8
     assert ends[1] > 1.3 * ends[0]
-
-
-def test_the_end_of_one_changes_no_other():
-    tracker = Tracker(TrackerSettings(edges=(), association=AssociationSettings(relink_above=1.0)))
-    both = [frame(0.1 * k, [(0.0, 0.0), (20.0, 0.1 * k)]) for k in range(10)]
-    run(tracker, both)
-    later = run(tracker, [frame(0.1 * k, [(0.0, 0.0)]) for k in range(10, 40)])
-    assert later[-1].id.tolist() == [1]
-    assert np.isfinite(later[-1].position_covariance).all()

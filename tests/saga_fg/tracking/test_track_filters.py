@@ -25,12 +25,7 @@ from saga_fg.tracking.track_filters import (
     TurnRate,
 )
 from tests.saga_fg.traffic_frames import (
-    assert_estimators_agree,
-    at_pose,
     frame,
-    seen,
-    straight,
-    turning_vehicle,
 )
 
 NAN = float("nan")
@@ -171,21 +166,10 @@ def test_fronts_are_where_most_detections_or_a_clear_motion_say():
 # The belief that an object stands, and what follows from it
 
 SETTINGS = TrackerSettings(edges=(), stationary_share=0.5)
-TIMES = np.arange(60) * 0.1
 
 
 def kinematics(position=(0.0, 0.0), velocity=(0.0, 0.0), P=0.04, P_velocity=4.0):
     return Kinematics(np.array([position]), np.array([velocity]), P * np.eye(2)[None], P_velocity * np.eye(2)[None])
-
-
-def probabilities(frames, settings=SETTINGS):
-    """Stationarity of a single track after every frame."""
-    tracker, found = Tracker(settings), []
-    for f in frames:
-        tracker.step(f)
-        stationarity = tracker.snapshot().table.stationarity
-        found.append(stationarity.probability.item())
-    return found
 
 
 def test_the_belief_is_that_of_bayes():
@@ -235,21 +219,6 @@ def test_fast_objects_do_not_halt_and_one_that_has_is_where_the_joint_filter_has
     stationarity.predict(0.1, kinematics(position=(30.0, 4.0)))
     assert stationarity.position[0] == pytest.approx([30.0, 4.0], abs=1e-3)
     assert stationarity.P[0] == pytest.approx((0.04 + 0.1 * DRIFT**2) * np.eye(2))
-
-
-def test_what_stands_and_what_moves_is_reported_apart_and_so_are_departures():
-    rng = np.random.default_rng(4)
-    parked = probabilities(seen(rng, straight((5.0, 0.0), (0.0, 0.0)), TIMES, noise=0.1))
-    driven = probabilities(seen(rng, straight((5.0, 0.0), (6.0, 0.0)), TIMES, noise=0.1))
-    assert min(parked[20:]) > 0.95
-    assert max(driven[10:]) < 0.01
-
-    def leaves(t):
-        return np.array([(5.0 + 1.5 * max(t - 3.0, 0.0) ** 2, 0.0)])
-
-    departing = probabilities(seen(rng, leaves, TIMES, noise=0.1))
-    assert departing[29] > 0.9
-    assert departing[-1] < 0.01
 
 
 def test_what_is_reported_is_the_mean_and_the_covariance_of_the_mixture():
@@ -363,8 +332,6 @@ def test_beyond_two_deviations_of_its_innovation_a_heading_counts_less():
 
 RADAR = Sensor(noise={"default": NoiseModel(position=0.5, range_rate=0.1)})
 RANGE_RATE_SENSORS = {"radar": RADAR, "lidar": Sensor(noise={"default": NoiseModel(position=0.3)})}
-TRUTH = straight([(30, 5), (-15, 30), (40, -20)], [(12, 0), (3, -9), (0, 6)])
-VELOCITY = TRUTH(1) - TRUTH(0)
 
 
 def with_rates(plain, rate, pose=None):
@@ -374,20 +341,6 @@ def with_rates(plain, rate, pose=None):
 
 def radar_frame(timestamp, position, rate, pose=None, **fields):
     return with_rates(frame(timestamp, position, "radar", size=(NAN,) * 3, yaw=NAN, **fields), rate, pose)
-
-
-def traffic(seed):
-    """A radar on a moving vehicle and a LiDAR, in order of time."""
-    rng = np.random.default_rng(seed)
-    frames = []
-    for t in np.arange(0, 3, 0.1):
-        where = TRUTH(t)
-        pose = turning_vehicle(t)
-        sight = where - pose[:2, 3]
-        rate = np.sum(VELOCITY * sight, axis=1) / np.hypot(*sight.T) + 0.1 * rng.normal(size=3)
-        frames.append(radar_frame(t, where + 0.5 * rng.normal(size=(3, 2)), rate, pose))
-        frames.append(frame(t + 0.04, where + 0.04 * VELOCITY + 0.3 * rng.normal(size=(3, 2))))
-    return frames
 
 
 def tracker(estimator="kalman", sensors=RANGE_RATE_SENSORS):
@@ -411,30 +364,6 @@ def test_lines_of_sight_begin_at_the_sensor_and_have_no_meaning_at_it():
     assert tracks.boxes.velocity[0] == pytest.approx([7.0, 0.0], abs=0.05)
     tracks = tracker().step(radar_frame(0.0, [(0, 0)], [9.0]))
     assert tracks.boxes.velocity[0].tolist() == [0.0, 0.0]
-
-
-def test_every_estimator_gives_the_same_tracks():
-    assert_estimators_agree(TrackerSettings(), RANGE_RATE_SENSORS, traffic(0), covariances=1e-7)
-
-
-@pytest.mark.parametrize("estimator", ["kalman", "isam2", "fixed-lag"])
-def test_a_late_range_rate_is_taken_in(estimator):
-    t = Tracker(TrackerSettings(estimator=estimator, edges=(), max_delay=0.5, lag=1.0), RANGE_RATE_SENSORS)
-    for time in (0.0, 0.2, 0.4):
-        before = t.step(frame(time, [(30, 40)]))
-    after = t.step(radar_frame(0.3, [(30, 40)], [-2.0]))
-    sight = np.array([0.6, 0.8])
-    assert abs(after.boxes.velocity[0] @ sight + 2.0) < abs(before.boxes.velocity[0] @ sight + 2.0)
-    assert sight @ after.velocity_covariance[0] @ sight < sight @ before.velocity_covariance[0] @ sight
-
-
-def test_detections_carry_range_rates_through_selection_and_transformation():
-    table = Detections.of([Detection("car", (1, 0, 0), range_rate=-3.0), Detection("car", (2, 0, 0))])
-    assert np.isnan(table.range_rate).tolist() == [False, True]
-    assert table.select([1, 0]).transformed(yaw_transform(5, 5, 0, 1.0)).range_rate[1] == -3.0
-    assert table[0].range_rate == -3.0
-    ego = at_pose(Frame(0.0, "radar", table, np.eye(4)), turning_vehicle(1.0), "ego")
-    assert ego.detections.range_rate[0] == -3.0
 
 
 def test_wrong_range_rates_are_refused_and_need_a_place_to_be_seen_from(subtests):

@@ -217,7 +217,7 @@ def test_scores_are_those_of_the_detections_and_of_steadiness():
 
 @pytest.mark.parametrize("family", ["kitti", "nuscenes"])
 @given(data=st.data())
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_a_score_is_monotone_in_all_evidence_of_the_track(family, data):
     """A higher probability of any detection lowers no score, then or later."""
     count = 8
@@ -264,16 +264,6 @@ def unresolved_settings(**values):
     return TrackerSettings(classes, edges=(), **{"tentative_score_factor": 0.1, **values})
 
 
-@pytest.mark.parametrize(("label", "spacing"), [("motorcycle", 0.7), ("pedestrian", 0.6)])
-def test_objects_that_stand_close_together_all_count_after_a_while(label, spacing):
-    row, rng = np.stack([spacing * np.arange(8), np.zeros(8)], axis=1), np.random.default_rng(0)
-    tracker = Tracker(unresolved_settings())
-    for k in range(30):
-        tracks = tracker.step(crowd_frame(0.5 * k, row + 0.05 * rng.normal(size=row.shape), 0.7, label))
-    assert len(tracks) == 8
-    assert (tracks.score > 0.2).sum() >= 7
-
-
 def test_a_second_box_is_tentative_until_seen_twice_beside_the_first():
     tracks = Tracker(unresolved_settings()).step(crowd_frame(0.0, [(0.5, 0.0), (0.0, 0.0)], [0.5, 0.8]))
     assert tracks.score.tolist() == [pytest.approx(0.05), pytest.approx(0.8)]
@@ -285,16 +275,6 @@ def test_a_second_box_is_tentative_until_seen_twice_beside_the_first():
     run(tracker, [crowd_frame(0.1 * k, [(0.0, 0.0)], 0.8) for k in range(5)])
     both = [tracker.step(crowd_frame(0.5 + 0.1 * k, [(0.0, 0.0), (0.4, 0.0)], 0.6)) for k in range(6)]
     assert all(tracks.score[1] == pytest.approx(0.06) for tracks in both)
-
-
-def test_an_object_that_walks_away_from_another_counts_from_there_on():
-    tracker = Tracker(unresolved_settings())
-    scores = []
-    for k in range(8):
-        tracks = tracker.step(crowd_frame(0.1 * k, [(0.0, 0.0), (0.35 + 0.08 * k, 0.0)], [0.8, 0.6], "pedestrian"))
-        scores.append(tracks.score[1])
-    assert scores[0] == pytest.approx(0.06)
-    assert scores[-1] == pytest.approx(0.6)
 
 
 def test_a_second_box_is_matched_to_what_the_others_leave():
@@ -332,19 +312,6 @@ def test_rough_positions_or_no_tentative_tracks_change_what_a_second_box_is():
 def test_boxes_of_unknown_extent_are_objects_of_their_own(unknown):
     tracks = Tracker(unresolved_settings()).step(crowd_frame(0.0, [(0.0, 0.0), (0.5, 0.0)], [0.8, 0.6], **unknown))
     assert tracks.score.tolist() == [pytest.approx(0.8), pytest.approx(0.6)]
-
-
-def test_other_classes_share_one_certainty():
-    boxes = crowd_frame(0.0, [(0.0, 0.0), (0.0, 0.4)], [0.8, 0.6]).detections
-    labels = np.array(["motorcycle", "pedestrian"])
-    frame = Frame(
-        0.0,
-        "lidar",
-        Detections(
-            Boxes(labels, *(getattr(boxes.boxes, n) for n in ("position", "size", "yaw", "velocity"))), boxes.score
-        ),
-    )
-    assert Tracker(unresolved_settings()).step(frame).score.tolist() == [pytest.approx(0.8), pytest.approx(0.2)]
 
 
 @pytest.mark.parametrize("estimator", ["kalman", "isam2", "fixed-lag"])

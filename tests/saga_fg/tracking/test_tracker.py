@@ -12,11 +12,9 @@ from saga_fg import (
     TrackerSettings,
 )
 from saga_fg.model.sensor import Extrinsics, FieldOfView, NoiseModel
-from saga_fg.numerics.geometry import inverse_transform
 from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings
 from tests.saga_fg.traffic_frames import (
     NAN,
-    SIZE,
     assert_same,
     at_pose,
     columns,
@@ -44,23 +42,6 @@ def settings(edges=(), **values):
 # one object
 
 
-def test_a_single_car_is_one_track_from_beginning_to_end():
-    truth = straight((5.0, -3.0), (10.0, 2.0))
-    frames = seen(np.random.default_rng(1), truth, TENTHS, yaw=np.arctan2(2, 10))
-    history = run(Tracker(), frames)
-    assert {tuple(tracks.id.tolist()) for tracks in history} == {(1,)}
-    last = history[-1]
-    assert last.timestamp == frames[-1].timestamp
-    assert last.boxes.label.tolist() == ["car"]
-    assert last.boxes.position[0, :2] == pytest.approx(truth(last.timestamp)[0], abs=0.3)
-    assert last.boxes.position[0, 2] == pytest.approx(1.0)
-    assert last.boxes.velocity[0] == pytest.approx([10.0, 2.0], abs=1.0)
-    assert last.boxes.size[0] == pytest.approx(SIZE)
-    assert last.boxes.yaw[0] == pytest.approx(np.arctan2(2, 10))
-    assert last.score[0] == pytest.approx(0.9)
-    assert last.coasting.tolist() == [0.0]
-
-
 def test_velocities_are_taken_in_or_unknown_along_the_heading():
     first = Tracker().step(frame(0.0, [(0, 0)], velocity=(7.0, -1.0)))
     assert first.boxes.velocity[0] == pytest.approx([7.0, -1.0])
@@ -70,20 +51,6 @@ def test_velocities_are_taken_in_or_unknown_along_the_heading():
     assert known == pytest.approx(np.diag([1.0, 25.0]), abs=1e-12)
     unknown = Tracker().step(frame(0.0, [(0, 0)], yaw=NAN)).velocity_covariance[0]
     assert unknown == pytest.approx(25.0 * np.eye(2))
-
-
-def test_what_was_not_measured_does_no_harm(subtests):
-    for unknown in [{"velocity": (NAN, NAN)}, {"velocity": (10.0, NAN)}, {}, {"size": (NAN,) * 3}, {"yaw": NAN}]:
-        with subtests.test(unknown=unknown):
-            truth = straight((0, 0), (10, 0))
-            history = run(Tracker(), seen(np.random.default_rng(0), truth, TENTHS, **unknown))
-            assert history[-1].id.tolist() == [1]
-            assert history[-1].boxes.position[0, :2] == pytest.approx(truth(TENTHS[-1])[0], abs=0.4)
-            assert np.isfinite(history[-1].boxes.velocity).all()
-            if "yaw" in unknown:
-                assert np.isnan(history[-1].boxes.yaw).all()
-            if "size" in unknown:
-                assert np.isnan(history[-1].boxes.size).all()
 
 
 # initiation, coasting, deletion
@@ -121,19 +88,6 @@ def test_tracks_coast_die_and_are_found_again_in_time():
     assert (again.id.tolist(), again.coasting.tolist()) == ([1], [0.0])
 
 
-def test_ids_are_never_reused():
-    rng = np.random.default_rng(4)
-    tracker, met = Tracker(settings(max_coasting=0.3)), {}
-    for k in range(60):
-        position = rng.uniform(-60, 60, (int(rng.integers(0, 5)), 2))
-        for track in tracker.step(frame(0.2 * k, position, score=0.95)):
-            if track.id in met:
-                assert k - met[track.id] <= 2, f"track {track.id} came back"
-            met[track.id] = k
-    assert len(met) > 30
-    assert sorted(met) == list(range(1, len(met) + 1))
-
-
 def test_doubtful_tracks_end_by_misses_where_the_sensor_looks_and_not_elsewhere():
     ahead = Sensor(field_of_view=FieldOfView(min_azimuth=-0.5, max_azimuth=0.5))
     pose = {"world_T_ego": np.eye(4)}
@@ -153,20 +107,6 @@ def test_belief_reports_tracks_and_keeps_them_alive():
     tracker = Tracker(settings(report_above=0.7))
     assert len(tracker.step(frame(0.0, [(0, 0)], score=0.5))) == 0
     assert tracker.step(frame(0.1, [(0, 0)], score=0.5)).id.tolist() == [1]
-
-
-def test_frames_without_detections_and_after_a_long_time():
-    tracker = Tracker()
-    for t in (0.0, 0.1, 9.0):
-        assert len(tracker.step(frame(t, []))) == 0
-    assert tracker.step(frame(9.1, [(1, 1)])).id.tolist() == [1]
-    assert tracker.step(frame(9.2, [])).coasting == pytest.approx([0.1])
-    tracker = Tracker()
-    for t in (0.0, 0.1):
-        tracker.step(frame(t, [(5 * t, 0), (10 + 5 * t, 0)], velocity=(5, 0)))
-    assert tracker.step(frame(1000.0, [(300, 0)])).id.tolist() == [1, 2], "nobody believes it yet"
-    assert tracker.step(frame(1000.1, [(300, 0)])).id.tolist() == [3]
-    assert len(tracker.step(frame(1000.2, [(300, 0)]))) == 1
 
 
 def test_of_duplicates_the_stronger_starts_the_track():
@@ -229,17 +169,6 @@ def test_far_from_the_origin_nothing_changes(first):
     T[:3, 3] = shift
     moved = [Frame(f.timestamp, f.sensor, f.detections.transformed(T)) for f in frames]
     assert_same(run(Tracker(), frames), run(Tracker(), moved), 2e-9 * 4e6 / 4, shift=shift)
-
-
-def test_a_turned_world_turns_the_tracks():
-    T = turning_vehicle(2.0)
-    frames = traffic()
-    turned = [Frame(f.timestamp, f.sensor, f.detections.transformed(T)) for f in frames]
-    for a, b in zip(run(Tracker(), frames), run(Tracker(), turned), strict=True):
-        back = b.boxes.transformed(inverse_transform(T))
-        assert a.id.tolist() == b.id.tolist()
-        assert back.position == pytest.approx(a.boxes.position, abs=1e-6)
-        assert back.velocity == pytest.approx(a.boxes.velocity, abs=1e-6)
 
 
 def test_the_same_frames_in_any_order_of_detections_give_the_same_tracks():

@@ -8,13 +8,12 @@ import pytest
 from saga_fg import (
     ConstantAcceleration,
     ConstantVelocity,
-    Curvilinear,
     InputError,
     Sensor,
     Tracker,
     TrackerSettings,
 )
-from saga_fg.model.edge_rules import Following, Neighbours, Pairs
+from saga_fg.model.edge_rules import Neighbours, Pairs
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.sensor import FieldOfView, NoiseModel
 from saga_fg.tracking import AssociationSettings, ClassSettings, ExistenceSettings
@@ -31,26 +30,6 @@ def braking_platoon(t, n=4, gap=14.0):
     braking = np.clip(t - 3.0, 0.0, 4.0)
     ahead = 12.0 * t - braking**2 - 8.0 * max(0.0, t - 7.0)
     return np.stack([ahead - gap * np.arange(n), np.zeros(n)], axis=-1)
-
-
-def hidden_car_error(edges, seed, hidden=2, since=3.5, until=6.5):
-    """Distance of the third car's track from the car when it has been hidden while all were braking."""
-    rng = np.random.default_rng(seed)
-    tracker = Tracker(TrackerSettings(edges=edges, **PATIENT))
-    for t in np.arange(0.0, until, 0.1):
-        position = braking_platoon(t) + 0.1 * rng.normal(size=(4, 2))
-        visible = np.ones(4, dtype=bool)
-        visible[hidden] = t < since
-        tracks = tracker.step(frame(t, position[visible]))
-    assert tracks.id.tolist() == [1, 2, 3, 4]
-    return float(np.linalg.norm(tracks.boxes.position[hidden, :2] - braking_platoon(tracks.timestamp)[hidden]))
-
-
-def test_a_hidden_member_of_a_platoon_is_carried_by_those_still_seen():
-    with_graph = np.mean([hidden_car_error((Following(), Neighbours()), seed) for seed in range(5)])
-    without = np.mean([hidden_car_error((), seed) for seed in range(5)])
-    assert without > 5.0, "the test would show nothing"
-    assert with_graph < 0.5 * without
 
 
 def test_a_node_that_dies_leaves_its_information_and_its_neighbours():
@@ -162,7 +141,6 @@ SENSORS = {
 }
 LABEL = ["car", "truck", "car", "car"]
 TRUTH = straight([(0, 0), (-15, 0.3), (-30, 0), (5, 40)], [(12, 0), (12, 0), (11, 0), (0, -9)])
-ESTIMATORS = ["kalman", "isam2", "fixed-lag"]
 
 
 def tracker(estimator="kalman", **values):
@@ -204,44 +182,6 @@ def test_a_smoother_takes_late_frames_as_if_they_had_come_in_time(delay):
     assert np.abs(prompt.tracks(4.5).boxes.position - without.tracks(4.5).boxes.position).max() > 0.01
 
 
-def test_how_late_a_frame_may_be_is_the_smoothers_lag():
-    smoother, filtering = tracker("fixed-lag", edges=(), lag=2.0), tracker(edges=(), lag=2.0)
-    for t in (smoother, filtering):
-        run(t, traffic(3)[0])
-        t.step(frame(2.2, TRUTH(2.2)[:3], "camera", label=LABEL[:3]))
-    assert (smoother.late_frames, filtering.late_frames) == (0, 1)
-    smoother.step(frame(1.5, TRUTH(1.5)[:3], "camera", label=LABEL[:3]))
-    assert smoother.late_frames == 1
-
-
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_late_frames_of_objects_born_since(estimator):
-    t = tracker(estimator, edges=())
-    t.step(frame(0.0, [(50, 50)]))
-    t.step(frame(1.0, [(50, 50), (0, 0)], velocity=(10.0, 0.0)))
-    tracks = t.step(frame(0.8, [(50, 50), (-2, 0)], "camera"))
-    assert tracks.id.tolist() == [1, 2]
-    assert tracks.boxes.position[1, 0] == pytest.approx(0.0, abs=0.1)
-
-
-@pytest.mark.parametrize("edges", [(), TrackerSettings().edges])
-def test_every_estimator_takes_the_same_turns(edges):
-    """Two that turn, one behind the other, of which one is not detected at last."""
-    rng, rate, speed, frames = np.random.default_rng(5), 0.3, 8.0, []
-    for t in np.arange(0, 4, 0.1):
-        angle = rate * t - np.array([0.0, 0.4])
-        place = speed / rate * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=-1)
-        z, there = place + 0.1 * rng.normal(size=(2, 2)), slice(2 if t < 3 else 1)
-        frames.append(frame(t, z[there], label=LABEL[there], yaw=angle[there]))
-    classes = {label: replace(of_class, motion=Curvilinear(turn_time=1.5)) for label, of_class in CLASSES.items()}
-    settings = TrackerSettings(classes, edges=edges)
-    assert_estimators_agree(settings, SENSORS, frames)
-    reference = Tracker(settings, SENSORS)
-    run(reference, frames)
-    assert any(reference.graph.motions), "turns were recorded"
-    assert np.isclose(np.hypot(*reference.tracks(4.5).boxes.velocity[0]), speed, atol=1.0)
-
-
 # Several sensors at once: who may start a track, what scores add up to, and sensors that fall silent
 
 WEAK = {"camera": Sensor(initiation="confirmed", noise={"default": NoiseModel(position=0.5)})}
@@ -277,17 +217,3 @@ def test_what_a_better_sensor_overlooks_counts_only_while_that_does_not_look():
     tracker = Tracker(independent(), WEAK)
     assert len(run(tracker, [frame(0.0, [], **here), frame(0.01, (10.0, 0.0), "camera", **here)])[-1]) == 0
     assert len(tracker.step(frame(0.1, (10.0, 0.0), **here))) == 1, "the other sensor confirms it"
-
-
-@pytest.mark.parametrize("method", ["kalman", "fixed-lag"])
-def test_tracks_live_on_the_other_sensor_while_one_is_out(method):
-    rng = np.random.default_rng(4)
-    truth = straight([(5.0, -3.0), (5.0, 3.0)], [(8.0, 0.0), (9.0, 0.5)])
-    lidar = [f for f in seen(rng, truth, np.arange(0, 8, 0.1)) if not 2.0 < f.timestamp < 5.0]
-    camera = seen(rng, truth, np.arange(0.03, 8, 0.08), noise=0.4, sensor="camera")
-    tracker = Tracker(independent(estimator=method), WEAK)
-    history = run(tracker, sorted(lidar + camera, key=lambda f: f.timestamp))
-    assert all(sorted(t.id.tolist()) == [1, 2] for t in history)
-    last = history[-1]
-    order = np.argsort(last.id)
-    assert last.boxes.position[order, :2] == pytest.approx(truth(last.timestamp), abs=0.4)

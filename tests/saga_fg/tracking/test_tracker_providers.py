@@ -1,70 +1,30 @@
 """Providers of factors in the tracker, nodes of the map by tiles, and predictions."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 
-from factors import ResidualFactors
 from saga_fg import ConstantAcceleration, ConstantVelocity, Curvilinear, Frame, InputError, Tracker, TrackerSettings
 from saga_fg.estimators import GraphFilter, JointKalmanFilter
 from saga_fg.estimators.reference import Gaussian, kalman_predict
-from saga_fg.graph import OBJECT, Additions, GraphView
-from saga_fg.model.edge_rules import Following, Neighbours
+from saga_fg.graph import EGO_POSE
+from saga_fg.model.edge_rules import Following
 from saga_fg.model.interactions import SharedVelocity
 from saga_fg.model.map_rules import RedLight
 from saga_fg.model.sensor import NoiseModel, Sensor
-from saga_fg.tracking import AssociationSettings, ClassSettings
+from saga_fg.tracking import ClassSettings
 from saga_fg.tracking.map_nodes import Element, elements, in_known_names
 from saga_fg.types.boxes import MAX_POSITION
 from saga_fg.types.frame import Detection, Detections
 from saga_fg.types.road_map import Lane, RoadMap, StopLine, TrafficLight, Wall
-from tests.saga_fg.traffic_frames import assert_same, frame, run, seen, straight
-
-PLACE = np.array([5e5, -3e5])  # of the scene in the world
-CARS = straight(PLACE + np.array([(0.0, 3.0), (9.0, 3.2), (0.0, -40.0)]), [(1.2, 0.4), (1.2, 0.4), (1.0, 0.0)])
-SIDE_BY_SIDE = (Neighbours(),)
-ISAM2 = TrackerSettings(estimator="isam2", edges=SIDE_BY_SIDE)
+from tests.saga_fg.traffic_frames import frame, run, seen, straight
 
 
-class Quiet:
-    name = "quiet"
-
-    def factors(self, view: GraphView) -> Additions:
-        return Additions()
-
-
-class Range:
-    """A tape measure from the place to whoever is first: a nonlinear factor."""
-
-    name = "tape"
-
-    def __init__(self, metres: float = 4.0) -> None:
-        self.metres = metres
-
-    def factors(self, view: GraphView) -> Additions:
-        rows = [[one.key] for one in list(view.now(OBJECT).values())[:1]]
-        residual = partial(beyond, view.origin, self.metres)
-        return Additions(factors=[ResidualFactors(rows, (4,), residual, [[0.01]], name="range")])
-
-
-def beyond(origin: np.ndarray, metres: float, x: np.ndarray) -> np.ndarray:
-    return np.hypot(*(x[:, :2] + origin - PLACE).T)[:, None] - metres
-
-
-def frames(count: int = 12) -> list[Frame]:
-    return seen(np.random.default_rng(0), CARS, np.arange(count) / 10)
-
-
-@pytest.mark.parametrize("association", ["hungarian", "graph"])
-def test_a_provider_that_adds_nothing_changes_nothing(association):
-    matching = AssociationSettings(method=association)
-    plain = Tracker(TrackerSettings(association=matching, edges=SIDE_BY_SIDE, tolerance=0.0))  # exact, as iSAM2 is
-    quiet = Tracker(replace(ISAM2, association=matching), providers=[Quiet()])
-    for a, b in zip(run(plain, frames()), run(quiet, frames()), strict=True):
-        assert_same(a, b, 1e-6, 1e-4)
-    assert quiet.graph.edge_count > 0
+def test_providers_from_the_configuration():
+    tracker = Tracker(TrackerSettings(estimator="isam2", providers=("saga_fg.providers:Odometry",)))
+    tracker.step(frame(0.0, [(1, 0)]))
+    assert EGO_POSE in {one.kind for one in tracker.running_graph.variables.values()}
 
 
 def test_what_leads_to_no_provider_is_refused(subtests):
@@ -81,26 +41,6 @@ def test_what_leads_to_no_provider_is_refused(subtests):
     ]:
         with subtests.test(message), pytest.raises(InputError, match=message):
             Tracker(TrackerSettings(estimator="isam2", providers=(name,)))
-
-
-def test_providers_from_the_configuration():
-    named = TrackerSettings(estimator="isam2", providers=(f"{__name__}:Range",))
-    by_name, by_hand = Tracker(named), Tracker(ISAM2, providers=[Range()])
-    for f in frames(5):
-        assert_same(by_name.step(f), by_hand.step(f), 1e-12, 1e-10)
-
-
-@pytest.mark.parametrize(("name", "size"), [("isam2", 6), ("fixed-lag", 16)])
-def test_tracks_come_and_go_in_a_graph_that_stays_small(name, size):
-    association = AssociationSettings(relink_above=1.0)
-    settings = TrackerSettings(estimator=name, lag=0.5, association=association)
-    tracker, sizes = Tracker(settings, providers=[Range()]), []
-    for k in range(40):
-        where = CARS(0.1 * k)[[k // 20]] if k % 20 < 12 else np.empty((0, 2))
-        tracker.step(frame(0.1 * k, where))
-        graph = tracker.snapshot().joint[0].graph
-        sizes.append(len(graph.variables))
-    assert max(sizes) <= size
 
 
 # A road in several maps: elements that come again are known, others of a name that is taken get one of their own

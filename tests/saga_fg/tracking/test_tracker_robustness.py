@@ -1,7 +1,6 @@
 """Nothing that a sensor sends stops a tracker: steps are transactions, states stay in bounds, numbers are judged."""
 
 import logging
-import pickle
 from dataclasses import replace
 
 import hypothesis.strategies as st
@@ -148,23 +147,6 @@ def test_tracks_that_cannot_go_on_are_given_up_at_the_second_frame(monkeypatch, 
     assert "tracks [1, 2, 3] are deleted, they can't go on: singular" in caplog.text
 
 
-def test_frames_that_cannot_be_used_cost_no_tracks():
-    tracker = Tracker()
-    run(tracker, traffic())
-    beyond = yaw_pose(MAX_POSITION)
-    for k in range(4):  # a detection is beyond all bounds once it is in the world
-        unusable = Frame(1.0 + k / 10, "lidar", Detections.of([Detection("car", (1e8, 0, 0))]), beyond, "ego")
-        with pytest.raises(InputError, match="position"):
-            tracker.step(unusable)
-    assert tracker.step(frame(1.0, CARS(1.0))).id.tolist() == [1, 2, 3]
-
-
-def yaw_pose(x):
-    pose = POSE.copy()
-    pose[0, 3] = x
-    return pose
-
-
 # states stay in bounds
 
 
@@ -269,23 +251,3 @@ def test_settings_and_sensors_of_another_type_are_named(subtests):
                     make(**arguments)
                 with pytest.raises(InputError, match=r"snapshot: expected \w+Snapshot, got str"):
                     make().restore("state.json")
-
-
-@pytest.mark.parametrize("timestamp", [10**400, 10**5000, "a", None, [1.0]], ids=lambda t: type(t).__name__)
-def test_times_that_are_none_are_refused(timestamp):
-    for ask in (lambda: Frame(timestamp, "lidar", Detections.empty()), lambda: Tracker().tracks(timestamp)):
-        with pytest.raises(InputError, match="timestamp: expected a finite number of seconds"):
-            ask()
-
-
-def test_the_greedy_tracker_can_be_pickled():
-    tracker = GreedyTracker()
-    frames = traffic(20)
-    run(tracker, frames[:10])
-    tracker.step(frame(1e6, CARS(0.9)))
-    twin = pickle.loads(pickle.dumps(tracker))
-    assert twin.time_verdict == tracker.time_verdict == "unconfirmed"
-    expected = run(tracker, frames[10:])
-    for a, b in zip(expected, run(twin, frames[10:]), strict=True):
-        assert b.id.tolist() == a.id.tolist()
-        assert b.boxes.position == pytest.approx(a.boxes.position, abs=1e-9)

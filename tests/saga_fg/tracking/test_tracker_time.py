@@ -33,23 +33,6 @@ def error(tracks, truth):
 # several sensors
 
 
-def test_how_often_somebody_looks_does_not_change_where_things_are():
-    """Empty frames of a sensor that sees nothing are steps in between, and no more than that."""
-    truth = straight([(0, 0), (-15, 0), (-30, 0)], [(10, 0), (11, 0), (10, 0)])
-    frames = seen(np.random.default_rng(0), truth, np.arange(0, 3, 0.5), velocity=(10.0, 0.0))
-    blind = {"default": Sensor(), "blind": Sensor(detection_probability=0.0)}
-    with_steps = in_order([*frames, *(frame(t, [], "blind") for t in np.arange(0.05, 2.5, 0.1))])
-    for edges, tolerance in (((), 1e-9), (TrackerSettings().edges, 0.02)):
-        few, many = Tracker(TrackerSettings(edges=edges), blind), Tracker(TrackerSettings(edges=edges), blind)
-        run(few, frames)
-        run(many, with_steps)
-        a, b = few.tracks(3.0), many.tracks(3.0)
-        assert a.id.tolist() == b.id.tolist()
-        assert b.boxes.position == pytest.approx(a.boxes.position, abs=tolerance)
-        # headings turn with velocities from step to step, which correlates x and y by a millionth of their variances
-        assert b.position_covariance == pytest.approx(a.position_covariance, rel=0.05, abs=1e-5)
-
-
 def test_sensors_have_offsets_and_may_speak_at_one_instant():
     both = tracker()
     both.step(frame(0.0, [(0, 0)], "lidar"))
@@ -91,20 +74,6 @@ def test_late_frames_help_nearly_as_if_they_had_come_in_time(delay):
     assert np.mean(late) < np.mean(in_time) + 0.3 * (np.mean(without) - np.mean(in_time))
 
 
-def test_a_late_frame_finds_an_object_where_it_was():
-    t = tracker()
-    run(t, seen(np.random.default_rng(0), FAST, np.arange(0, 2, 0.1), noise=0.05))
-    before = t.tracks(1.9)
-    after = t.step(frame(1.6, FAST(1.6), "camera"))
-    assert after.timestamp == pytest.approx(1.9)
-    assert after.id.tolist() == [1, 2]
-    assert after.boxes.position[:, :2] == pytest.approx(FAST(1.9), abs=0.3)
-    assert (
-        np.trace(after.position_covariance, axis1=1, axis2=2) < np.trace(before.position_covariance, axis1=1, axis2=2)
-    ).all()
-    assert after.coasting == pytest.approx([0.0, 0.0])
-
-
 def test_an_object_that_only_a_late_frame_has_seen_has_moved_on_since():
     t = tracker()
     t.step(frame(1.0, [(50, 50)]))
@@ -139,18 +108,6 @@ def test_frames_that_come_too_late_are_left_out_and_counted():
 
 
 # looking ahead
-
-
-def test_looking_ahead_moves_tracks_by_their_velocity_and_makes_them_less_certain():
-    t = tracker()
-    now = run(t, seen(np.random.default_rng(0), FAST, np.arange(0, 2, 0.1)))[-1]
-    ahead = t.tracks(now.timestamp + 0.5)
-    assert ahead.timestamp == now.timestamp + 0.5
-    assert ahead.id.tolist() == now.id.tolist()
-    assert ahead.boxes.position[:, :2] == pytest.approx(now.boxes.position[:, :2] + 0.5 * now.boxes.velocity)
-    assert ahead.boxes.velocity == pytest.approx(now.boxes.velocity)
-    assert (ahead.position_covariance[:, 0, 0] > now.position_covariance[:, 0, 0]).all()
-    assert ahead.coasting == pytest.approx([0.5, 0.5])
 
 
 @pytest.mark.parametrize("edges", [(), TrackerSettings().edges], ids=["independent", "graph"])
@@ -299,17 +256,6 @@ def test_how_far_the_clock_may_jump_can_be_set():
         assert verdicts(tracker, [frame(60.0, [(0, 0)])]) == [expected]
 
 
-def test_tracks_that_outlive_a_jump_are_predicted():
-    settings = TrackerSettings({"default": ClassSettings(max_deviation=np.inf)}, max_coasting=np.inf)
-    tracker = Tracker(settings)
-    run(tracker, at(0.0, np.arange(10) / 10))
-    assert verdicts(tracker, [frame(20.0, []), frame(20.1, [])]) == ["unconfirmed", "set_ahead"]
-    tracks = tracker.step(frame(20.2, []))
-    assert tracks.id.tolist() == [1, 2]
-    assert tracks.coasting == pytest.approx([19.3, 19.3])
-    assert tracks.boxes.position[:, 0] == pytest.approx(CARS(20.2)[:, 0], abs=15.0)
-
-
 def test_names_of_sensors_without_end_are_not_remembered():
     clock = Clock()
     for k in range(3 * REMEMBERED):
@@ -319,14 +265,3 @@ def test_names_of_sensors_without_end_are_not_remembered():
     for k in range(200):
         tracker.step(frame(0.1 * k, [(0, 0)], sensor=f"sensor {k}", label=f"class {k}"))
     assert len(tracker.snapshot().table.sensors.sensors) < 50
-
-
-@ALL
-def test_the_same_ids_at_whatever_time_the_scene_begins(make):
-    rng = np.random.default_rng(3)
-    frames = [f for f in seen(rng, CARS, np.arange(60) / 10, noise=0.4) if rng.random() < 0.4]
-    told = []
-    for start in (0.0, 1.7e9):
-        tracks = run(make(), [frame(start + f.timestamp, f.detections.boxes.position[:, :2]) for f in frames])
-        told.append([each.id.tolist() for each in tracks])
-    assert told[0] == told[1]

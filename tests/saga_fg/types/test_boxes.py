@@ -130,16 +130,6 @@ def test_rows_by_mask_by_index_and_by_slice_are_the_same(boxes, data):
     assert same(parts.select(np.argsort(np.argsort(~mask, kind="stable"))), boxes)
 
 
-@given(st.lists(tables(), max_size=3))
-def test_joining_and_cutting_again(parts):
-    joined = Boxes.concatenate(parts)
-    start = 0
-    for part in parts:
-        assert same(joined.select(slice(start, start + len(part))), part)
-        start += len(part)
-    assert len(joined) == start
-
-
 # Overlap of oriented boxes: known cases, laws, and a plain polygon clipping as reference
 
 

@@ -47,16 +47,6 @@ def test_a_table_is_its_rows(rows):
     assert [fields(d) for d in again] == [fields(d) for d in table]
 
 
-@given(st.lists(detections, min_size=1, max_size=5), st.data())
-def test_selected_rows(rows, data):
-    table = Detections.of(rows)
-    chosen = data.draw(st.lists(st.integers(0, len(rows) - 1)))
-    assert [fields(d) for d in table.select(chosen)] == [fields(table[k]) for k in chosen]
-    mask = np.isin(np.arange(len(rows)), chosen)
-    assert [fields(d) for d in table.select(mask)] == [fields(table[k]) for k in sorted(set(chosen))]
-    assert len(table.select(slice(0, 1))) == 1
-
-
 def test_an_empty_table_and_one_that_moves():
     assert len(Detections.empty()) == len(Detections.of([])) == 0
     assert list(Detections.empty()) == []
@@ -134,17 +124,6 @@ def test_velocities_of_a_large_deviation_are_unknown():
     P = np.array([s**2 * np.eye(2) for s in (0.1, KNOWN_SPEED_DEVIATION, 2.1, np.nan)])
     known = known_velocities(np.ones((4, 2)), P)
     assert np.isfinite(known).all(axis=1).tolist() == [True, True, False, True]
-
-
-def test_rows_of_the_table():
-    tracks = table()
-    assert len(tracks) == 2
-    second = list(tracks)[1]
-    assert (second.id, second.label, second.position, second.score) == (8, "car", (3.0, 4.0, 5.0), 1.0)
-    assert second.velocity == (1.0, 1.0)
-    assert second.position_covariance.tolist() == [[1.0, 0.0], [0.0, 1.0]]
-    assert type(second.id) is int
-    assert type(second.coasting) is float
 
 
 def test_tables_of_tracks_are_selected_read_only_and_may_be_empty():
