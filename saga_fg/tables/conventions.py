@@ -208,9 +208,9 @@ def fitting_convention(
     now, usual = fits["rad"]
     said = f"{now:.0%} of those of moving objects differ from their motion, half of them by {usual:.2g} rad and more"
     astray, off = fits[best]
-    turned = share(np.abs(wrap_angle(2 * (given - direction))) > 2 * _ASTRAY)  # by something else than half a turn
+    turned = np.abs(wrap_angle(2 * (given - direction))) / 2  # by something else than half a turn
     better = (now >= 0.15 and astray <= now / 3) or (usual > _OFF and off < usual / 3)
-    better &= now > 0.5 or turned > 0.1  # some that are turned round are no convention
+    better &= now > 0.5 or share(turned > _ASTRAY) > 0.1 or float(np.median(turned)) > _OFF  # not some turned round
     if better and astray < 0.2 and off < _OFF:
         return HeadingFit(best, said)
     constant = np.ptp(given) < 1e-6
@@ -228,8 +228,8 @@ def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | Non
     """
     axes = np.where(sample.coordinates[sample.frame] == "ego", sample.ego[1], 0.0)
     of_objects = fitting_convention(sample.yaw, motion, sample.walks, axes)
-    none = np.zeros(len(sample.time), dtype=np.bool_)
-    of_ego = fitting_convention(sample.ego_yaw, sample.ego_motion, none)
+    slow = np.ones(len(sample.time), dtype=np.bool_)  # its path is known well
+    of_ego = fitting_convention(sample.ego_yaw, sample.ego_motion, slow)
     fits = {name: fit for name, fit in (("yaw", of_objects), ("ego_yaw", of_ego)) if fit is not None}
     wrong = {name: fit.unit for name, fit in fits.items() if fit.sure and fit.unit in _CONVENTIONS}
     if "ego_yaw" in wrong and (sample.coordinates == "ego").any():
@@ -251,7 +251,8 @@ def headings_against_motion(sample: Sample, motion: FloatArray) -> Finding | Non
         return Finding("headings", what, "expected counter-clockwise from x, rad")
     if of_objects.unit in ("world", ""):
         look = "look like those in the world, beside positions of the vehicle's frame"
-        what = f"headings {look if of_objects.unit else 'fit no convention'}: {said}"
+        none = "fit no convention" + ", or a pose lacks of a vehicle that moves" * bool(np.isnan(sample.ego_yaw).all())
+        what = f"headings {look if of_objects.unit else none}: {said}"
         expected = f"expected {'yaw - ego_yaw' if of_objects.unit else 'the direction of travel'}, or no headings"
         return Finding("headings", what, expected, Mend(columns={"yaw": ""}))
     return None
@@ -295,6 +296,8 @@ def _fits_better(sample: Sample, rows: IntArray, read: FloatArray, other: FloatA
     motions = [sample.motion(read), sample.motion(other)]
     own = int(turn is None)  # the one of them that is of the vehicle's frame
     motions[own] = rotated(motions[own], -sample.ego[1])
+    if own == 1 and _lean_over(sample, motions, rows):
+        return True
     for apart_of, least in ((_heading_apart, 0.12), (_velocity_apart, 0.3)):
         apart = [apart_of(sample, motion, rows) for motion in motions]
         decide = apart_of is _heading_apart or own == 1 or _far_from_origin(other[rows], sample.ego[0][rows])
@@ -309,16 +312,23 @@ _MOVE_WITH = "positions look like coordinates of the vehicle, but are taken for 
 _EGO = Finding("frame", _MOVE_WITH, "expected world coordinates, or coordinates: ego", Mend(coordinates="ego"))
 _STAY = "positions look like coordinates of the world, but are taken for the vehicle's: they do not move with it"
 _WORLD = Finding("frame", _STAY, "expected the vehicle's frame, or coordinates: world", Mend(coordinates="world"))
+_ALONG = 0.35  # rad between directions that are alike
 _TRAVELLED = 3.0  # m of the vehicle, from which it shows what moves with it
 _PAIRS = 20  # pairs of frames that are compared
 
 
+def _lean_over(sample: Sample, motions: Sequence[FloatArray], rows: IntArray) -> bool:
+    """True if what goes across fits `motions[1]` alone: seen from the vehicle it is headed elsewhere than it moves."""
+    across = rows[np.abs(np.sin(sample.yaw[rows])) > _ALONG]
+    return _less_apart([_heading_apart(sample, motion, across) for motion in motions], 0.12, 0.4)
+
+
 def _less_apart(apart: Sequence[FloatArray], least: float, most: float) -> bool:
-    """True if the median of the first is above `least`, and that of the second below the share `most` of it."""
+    """True if the median of the first is above `least`, and that of the second low, below the share `most` of it."""
     if min(map(len, apart)) < 2 * FEWEST:
         return False
     one, another = (float(np.median(each)) for each in apart)
-    return one > least and another < most * one
+    return one > least and another < min(most * one, 3 * least)
 
 
 def _velocity_apart(sample: Sample, motion: FloatArray, rows: IntArray) -> FloatArray:
@@ -336,7 +346,8 @@ def _heading_apart(sample: Sample, motion: FloatArray, rows: IntArray) -> FloatA
 
 _CARRIED = Finding(
     "frame",
-    "positions look like coordinates of a vehicle that moves, without its pose: what they share of their motion is its",
+    "positions look like coordinates of a vehicle that moves, whose pose is needed (ego_x, ego_y, ego_yaw): what they "
+    "share of their motion is its",
     "expected world coordinates, or ego_x, ego_y, ego_yaw and coordinates: ego",
     Mend(coordinates="ego"),
 )

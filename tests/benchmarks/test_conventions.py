@@ -78,8 +78,23 @@ def test_rows_of_the_vehicles_frame_without_its_pose_are_named(kind, speeds):
     world = table(kind, np.random.default_rng([88112, *map(ord, kind)]), speeds)
     pose = ["ego_x", "ego_y", "ego_yaw"]
     assert not read(world.drop(columns=pose)).findings
-    with pytest.raises(InputError, match=r"coordinates of a vehicle that moves, without its pose.*--coordinates ego"):
+    with pytest.raises(InputError, match=r"that moves, whose pose is needed.*--coordinates ego"):
         refuse_contradictions(read(_of_ego(world).drop(columns=pose)).findings)
+
+
+def test_cross_traffic_tells_the_vehicles_frame_without_velocities():
+    world = table("crossing", np.random.default_rng([13, *map(ord, "crossing")]), False)
+    assert not read(world).findings
+    with pytest.raises(InputError, match="they move with it; add --coordinates ego"):
+        refuse_contradictions(read(_of_ego(world)).findings)
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("crowd", 3), ("parked street", 3)])
+def test_compass_headings_of_the_vehicle_alone_are_named(kind, seed):
+    rows = _of_ego(table(kind, np.random.default_rng([seed, *map(ord, kind)]), False)).assign(coordinates="ego")
+    assert not read(rows).findings
+    with pytest.raises(InputError, match="headings of the vehicle look clockwise from north"):
+        refuse_contradictions(read(rows.assign(ego_yaw=wrap_angle(np.pi / 2 - rows.ego_yaw.to_numpy()))).findings)
 
 
 def placed(scene):
