@@ -136,7 +136,8 @@ class Meeting(NamedTuple):
         if self.other < self.own and slow and not self.walks[0]:
             yield "for people" if self.walks[1] else "waiting"
         if abs(self.own - self.other) <= AFTER and any(self.walks):
-            yield from ["people crossing"][not self.walks[0] :]
+            if self.walks[0]:
+                yield "people crossing"
         elif abs(self.own - self.other) <= AFTER:
             if self.own <= self.other:
                 yield "going"
