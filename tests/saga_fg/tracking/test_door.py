@@ -1,7 +1,5 @@
 """What comes in is checked once, at the door; inside, tables of tracks and measurements are not checked again."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -29,13 +27,6 @@ def frame(number, count=6):
     return Frame(0.1 * number, "lidar", Detections(boxes, np.full(count, 0.9)), np.eye(4))
 
 
-class Rule(Neighbours):
-    """A user's, who names rows the graph has not."""
-
-    def pairs(self, nodes):
-        return np.array([len(nodes)]), np.array([0]), np.array([0.5])
-
-
 class Law(SharedVelocity):
     """A user's, whose triples are not finite."""
 
@@ -44,16 +35,9 @@ class Law(SharedVelocity):
         return triples._replace(b=triples.b + np.nan)
 
 
-def tracked_with(rule):
-    config = load_config("nuscenes")
-    tracker = replace(config, tracker=replace(config.tracker, edges=(rule,))).new_tracker("saga")
-    return [tracker.step(frame(number)) for number in range(3)]
-
-
-def test_edges_by_rules_and_laws_of_users(subtests):
-    for rule, error in [(Rule(SharedVelocity()), "rule Rule"), (Neighbours(Law()), "of Law: b")]:
-        with subtests.test(error), pytest.raises(InputError, match=error):
-            tracked_with(rule)
+def test_a_law_of_a_user_is_checked():
+    with pytest.raises(InputError, match="of Law: b"):
+        TrackerSettings(edges=(Neighbours(Law()),))
 
 
 NONLINEAR = NonlinearEdges(SmoothDriver(), [0], [1], [1.0], [4.0])

@@ -116,16 +116,11 @@ def test_a_new_track_is_as_uncertain_as_its_detection(estimator):
     assert tracks.position_covariance[0] == pytest.approx(np.diag([0.01, 4.0]), abs=1e-6)
 
 
-def test_wrong_covariances_are_refused(subtests):
-    for covariance, message in [
-        (-ALONG, "position_covariance.0.: expected a positive definite"),
-        (0 * ALONG, "position_covariance.0.: expected a positive definite"),
-        (np.array([[[1.0, 0.5], [0.0, 1.0]]]), "position_covariance.0.: expected a symmetric"),
-        (np.ones((2, 2)), "position_covariance: expected shape"),
-        (np.array([[[1.0, np.nan], [np.nan, 1.0]]]), "position_covariance.0, 0, 1.: expected a finite number"),
-    ]:
-        with subtests.test(message), pytest.raises(InputError, match=message):
-            table(covariance)
+def test_wrong_covariances_are_refused():
+    with pytest.raises(InputError, match=r"position_covariance\[0\]: expected a positive definite"):
+        table(-ALONG)
+    with pytest.raises(InputError, match="position_covariance: expected shape"):
+        table(np.ones((2, 2)))
     with pytest.raises(InputError, match="expected a positive definite"):
         Detection("car", (0, 0, 0), position_covariance=(1.0, 2.0, 1.0))
 

@@ -366,14 +366,11 @@ def test_lines_of_sight_begin_at_the_sensor_and_have_no_meaning_at_it():
     assert tracks.boxes.velocity[0].tolist() == [0.0, 0.0]
 
 
-def test_wrong_range_rates_are_refused_and_need_a_place_to_be_seen_from(subtests):
-    for rate, message in [
-        (np.inf, r"range_rate\[0\]: expected a finite number, or NaN for unknown, got inf"),
-        ("fast", "range_rate: expected numbers"),
-        ([1.0, 2.0], r"range_rate: expected shape \(1,\), got \(2,\)"),
-    ]:
-        with subtests.test(message), pytest.raises(InputError, match=message):
-            Detections(Boxes.of(["car"], [(0, 0, 0)]), [0.5], rate if isinstance(rate, list) else [rate])
+def test_wrong_range_rates_are_refused_and_need_a_place_to_be_seen_from():
+    with pytest.raises(InputError, match=r"range_rate\[0\]: expected a finite number, or NaN for unknown, got inf"):
+        Detections(Boxes.of(["car"], [(0, 0, 0)]), [0.5], [np.inf])
+    with pytest.raises(InputError, match=r"range_rate: expected shape \(1,\), got \(2,\)"):
+        Detections(Boxes.of(["car"], [(0, 0, 0)]), [0.5], [1.0, 2.0])
     table = Detections.of([Detection("car", (1, 0, 0), range_rate=1.0)])
     with pytest.raises(InputError, match="world_T_ego: expected a pose, since range_rate is along the line of sight"):
         Frame(0.0, "radar", table)
