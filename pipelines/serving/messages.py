@@ -33,7 +33,7 @@ import numpy as np
 from pipelines.serving.settings import Address, StreamSettings
 from saga_fg import Boxes, Detections, Frame, InputError, PredictedTracks, Tracks
 from saga_fg.numerics import FloatArray, yaw_transform
-from saga_fg.types import Coordinates, checked_horizons
+from saga_fg.types import Coordinates, PredictedMode, checked_horizons
 
 MAX_HORIZON = 10.0  # furthest time of a prediction, s
 MAX_HORIZONS = 20  # largest number of times of a prediction
@@ -108,6 +108,7 @@ DETECTION = {
     "label": replace(_NAME, default="object"),
 }
 EGO = {"x": _NUMBER, "y": _NUMBER, "z": _optional(0.0), "yaw": _NUMBER}
+_MODES = Field("true or false", _checked(lambda value: type(value) is bool), False, null=False)
 _TYPE = {"type": Field("the type of a message", _NAME.read, "frame")}
 MESSAGES: Mapping[str, Mapping[str, Field]] = {
     "frame": {
@@ -123,7 +124,7 @@ MESSAGES: Mapping[str, Mapping[str, Field]] = {
     },
     "status": _TYPE,
     "subscribe": _TYPE,
-    "predict": {**_TYPE, "horizons": Field(f"a list of at most {MAX_HORIZONS} s", _horizons)},
+    "predict": {**_TYPE, "horizons": Field(f"a list of at most {MAX_HORIZONS} s", _horizons), "modes": _MODES},
     "reset": {**_TYPE, "sensor": replace(_NAME, default=None)},
 }
 """Fields of the messages that come in, by their type."""
@@ -143,12 +144,13 @@ class Request:
     """A message that is no frame; kind: its type.
 
     sensor    of a reset of the number of one sensor alone, whose next frame may have any
-    horizons  (H,) of a request for predictions, s after the newest frame
+    horizons  (H,) of a request for predictions, s after the newest frame; modes: whether to list the modes
     """
 
     kind: str
     sensor: str | None = None
     horizons: FloatArray = field(default_factory=lambda: np.empty(0))
+    modes: bool = False
 
 
 def parse_message(line: bytes, settings: StreamSettings) -> FrameMessage | Request:
@@ -196,25 +198,33 @@ def tracks_message(tracks: Tracks) -> dict[str, Any]:
     return message | ({"relations": relations} if relations else {})
 
 
-def predictions_message(predicted: PredictedTracks) -> dict[str, Any]:
-    """Return the answer to a request for predictions: lists over the horizons, in world coordinates."""
-    P = predicted.position_covariance
-    numbers = np.stack(
-        [
-            *np.moveaxis(predicted.position, -1, 0),
-            *np.moveaxis(predicted.velocity, -1, 0),
-            predicted.yaw,
-            *(P[..., 0, 0], P[..., 0, 1], P[..., 1, 1]),
-        ]
-    )
-    names = ("x", "y", "vx", "vy", "yaw", "cov_xx", "cov_xy", "cov_yy")
+def predictions_message(predicted: PredictedTracks, modes: bool = False) -> dict[str, Any]:
+    """Return the answer to a request for predictions, on request with `modes`: lists over the horizons, in world."""
+    names, horizons = predicted.id.tolist(), predicted.horizons.tolist()
+    yaw, kinds = _finite({"yaw": predicted.yaw}, len(names)), predicted.modes if modes else ()
     rows = [
-        {"id": id_, "label": label}
-        | {name: x for name, x in zip(names, numbers[:, :, n].tolist(), strict=True) if np.isfinite(x).all()}
-        for n, (id_, label) in enumerate(zip(predicted.id.tolist(), predicted.label.tolist(), strict=True))
+        {"id": id_, "label": label} | own | heading
+        for id_, label, own, heading in zip(names, predicted.label.tolist(), _states(predicted), yaw, strict=True)
     ]
-    horizons = predicted.horizons.tolist()
+    for mode in kinds:
+        shares = _finite({"probability": mode.probability}, len(names))
+        for row, share, own in zip(rows, shares, _states(mode), strict=True):
+            row.setdefault("modes", []).append({"mode": mode.name} | share | own)
     return {"type": "predictions", "timestamp": predicted.timestamp, "horizons": horizons, "tracks": rows}
+
+
+def _states(of: PredictedTracks | PredictedMode) -> list[dict[str, Any]]:
+    """Places, velocities and covariances of each track, lists over the horizons."""
+    x, v, P = of.position, of.velocity, of.position_covariance
+    columns = {"x": x[..., 0], "y": x[..., 1], "vx": v[..., 0], "vy": v[..., 1]}
+    columns |= {"cov_xx": P[..., 0, 0], "cov_xy": P[..., 0, 1], "cov_yy": P[..., 1, 1]}
+    return _finite(columns, x.shape[1])
+
+
+def _finite(columns: Mapping[str, FloatArray], n: int) -> list[dict[str, Any]]:
+    """The finite ones of columns (H, n) of each of n tracks, as lists."""
+    found = {name: column.T.tolist() for name, column in columns.items()}
+    return [{name: rows[k] for name, rows in found.items() if np.isfinite(rows[k]).all()} for k in range(n)]
 
 
 def late_message(newest: float) -> dict[str, Any]:

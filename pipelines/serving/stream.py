@@ -352,7 +352,7 @@ class StreamTracker(Generic[Client]):
         if message.kind == "subscribe":
             return [(client, {"type": "subscribe"})]
         if message.kind == "predict":
-            return [(client, self._predictions(message.horizons))]
+            return [(client, self._predictions(message.horizons, message.modes))]
         answers = self._flush()  # held frames would bring numbers back
         if message.sensor is None:
             before: Any = self._tracker
@@ -437,11 +437,11 @@ class StreamTracker(Generic[Client]):
         predicted = {} if self._horizons is None else {"predictions": self._predictions(self._horizons)}
         return self._shown(tracks) | predicted | clock | self._about(message)
 
-    def _predictions(self, horizons: FloatArray) -> Answer:
+    def _predictions(self, horizons: FloatArray, modes: bool = False) -> Answer:
         """Return the tracks at times after the newest frame, s. Raises `InputError` where there are none."""
         if isinstance(self._tracker, GreedyTracker):
             raise InputError("predict: expected --method saga or kf, centerpoint predicts nothing")
-        return predictions_message(self._tracker.predict(horizons))
+        return predictions_message(self._tracker.predict(horizons, hypotheses=modes), modes)
 
     def _about(self, message: FrameMessage) -> Answer:
         """Return the fields that identify a frame for its client, and the last number of its sensor on the disk."""

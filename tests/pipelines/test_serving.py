@@ -262,8 +262,8 @@ def test_addresses():
 # Predictions of a stream: with every frame, and on request
 
 
-def predict(horizons: Any) -> bytes:
-    return encode({"type": "predict", "horizons": horizons})
+def predict(horizons: Any, **more: Any) -> bytes:
+    return encode({"type": "predict", "horizons": horizons} | more)
 
 
 def test_a_request_is_answered_with_the_trackers_predictions():
@@ -283,6 +283,25 @@ def test_a_request_is_answered_with_the_trackers_predictions():
     np.testing.assert_allclose(car["cov_xy"], expected.position_covariance[:, 0, 0, 1])
     assert car["cov_xx"][0] < car["cov_xx"][1]
     assert "yaw" not in car or len(car["yaw"]) == 2
+
+
+def test_modes_come_where_they_are_asked_for():
+    service = stream()
+    answers(service, *(frame(0.1 * k) for k in range(10)))
+    (plain,), (answer,) = answers(service, predict([0.5, 2])), answers(service, predict([0.5, 2], modes=True))
+    (car,) = answer["tracks"]
+    modes = car.pop("modes")
+    assert answer == plain, "mean and covariance are the same"
+    tracker = service._tracker
+    assert isinstance(tracker, Tracker)
+    expected = tracker.predict([0.5, 2], hypotheses=True).modes
+    assert [mode["mode"] for mode in modes] == [mode.name for mode in expected]
+    np.testing.assert_allclose(np.sum([mode["probability"] for mode in modes], axis=0), 1.0)
+    for mode, one in zip(modes, expected, strict=True):
+        np.testing.assert_allclose([mode["x"], mode["y"]], one.position[:, 0].T)
+        np.testing.assert_allclose(mode["cov_xx"], one.position_covariance[:, 0, 0, 0])
+    (wrong,) = answers(service, predict([1], modes="all"))
+    assert "modes: expected true or false, got 'all'" in wrong["message"]
 
 
 def test_predictions_come_with_frames_or_requests_that_change_nothing():
