@@ -173,7 +173,6 @@ EDGE_SE3_PRIOR 1 4 5 0 0.5 0 0 0.7071067811865476 0.7071067811865476 100 0 0 0 0
 def test_all_planar_records_agree_on_one_world(tmp_path):
     """The measurements are those of the poses (5.0, 3.0, 0.5) ..., so the optimum has no error."""
     graph = read_g2o(written(tmp_path, PLANAR_LANDMARKS))
-    assert graph.landmarks is not None
     assert len(graph.landmarks.pose) == 4
     assert graph.landmarks.position.tolist() == [[8, 8], [4, 7]]
     optimised = optimise_poses(graph)
@@ -208,8 +207,6 @@ def test_writing_and_reading_gives_the_same_graph(tmp_path, text):
 def test_offsets_of_sensors_are_taken_into_the_measurements(tmp_path):
     """A sensor half a metre up, turned to the left, sees the landmark (3, 4, 1) at (4, -3, 0.5)."""
     graph = read_g2o(written(tmp_path, SPATIAL_LANDMARKS))
-    assert graph.landmarks is not None
-    assert graph.priors is not None
     np.testing.assert_allclose(graph.landmarks.z, [[3, 4, 1], [1, 4, 1]], atol=1e-12)
     np.testing.assert_allclose(np.diag(graph.landmarks.information[0]), [4, 1, 9], atol=1e-12)
     np.testing.assert_allclose(graph.priors.world_T_pose[0, :3, 3], [5, 0, 0], atol=1e-12)
@@ -224,7 +221,6 @@ def test_offsets_of_sensors_are_taken_into_the_measurements(tmp_path):
 def test_without_vertices_landmarks_start_where_they_are_seen(tmp_path):
     edges = "\n".join(line for line in PLANAR_LANDMARKS.splitlines() if not line.startswith("VERTEX")) + "\n"
     graph = read_g2o(written(tmp_path, edges))
-    assert graph.landmarks is not None
     assert np.isfinite(graph.landmarks.position).all()
     found = optimise_poses(graph)
     whole = optimise_poses(read_g2o(written(tmp_path, PLANAR_LANDMARKS)))
@@ -251,7 +247,6 @@ def test_landmarks_that_nobody_saw_are_left_out_with_a_warning(tmp_path, caplog)
     read_g2o(written(tmp_path, PLANAR_LANDMARKS))
     assert caplog.text == ""
     graph = read_g2o(written(tmp_path, PLANAR_LANDMARKS.replace("VERTEX_XY 11", "VERTEX_XY 12 1 1\nVERTEX_XY 11")))
-    assert graph.landmarks is not None
     assert graph.landmarks.ids.tolist() == [10, 11]
     assert "graph.g2o: VERTEX_XY 12 is left out, no measurement is of it (1 so)" in caplog.text
     alone = "\n".join(line for line in PLANAR_LANDMARKS.splitlines() if line.startswith(("VERTEX", "EDGE_SE2 ")))
@@ -318,7 +313,6 @@ def test_a_prior_on_the_largest_id_is_solved(tmp_path):
         f"EDGE_PRIOR_SE2 {last} 5 0 0 1 0 0 1 0 1\n"
     )
     optimised = optimise_poses(read_g2o(path), certify=True)
-    assert optimised.chordal is not None
     for poses in (optimised.world_T_pose, optimised.chordal.world_T_pose):
         np.testing.assert_allclose(poses[:, 0, 2], [4, 5], atol=1e-6)
 

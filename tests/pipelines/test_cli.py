@@ -294,7 +294,6 @@ def test_while_modules_are_imported(tmp_path, module):
     recording = long_recording(tmp_path)
     arguments = ("track", "file", recording, "--output", tmp_path / "t.csv")
     process = start(tmp_path, *arguments, python=("-X", "importtime"))
-    assert process.stderr is not None
     while not (line := process.stderr.readline()).rstrip().endswith(f" {module}"):
         assert line, "the process has ended"
     said = terminate(process, lambda: True)

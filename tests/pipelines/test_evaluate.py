@@ -181,7 +181,6 @@ def test_the_moment_shown_has_the_most_moving_hidden_objects(comparison):
     assert run.scene.ground_truth is not None
 
     def hidden(scene: Scene, k: int) -> int:
-        assert scene.ground_truth is not None
         truth = scene.ground_truth[k]
         near = np.hypot(*(truth.boxes.position[:, :2] - scene.world_T_ego[k, :2, 3]).T) < 40
         return int((~truth.visible & near & (np.hypot(*truth.boxes.velocity.T) > 0.5)).sum())

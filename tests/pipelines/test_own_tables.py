@@ -60,7 +60,6 @@ def test_from_a_strangers_table_to_a_judged_result(tmp_path, monkeypatch, caplog
     assert not caplog.records
     assert "6 tracks" in result.stdout
     record = read_run_record(tmp_path / "tracks.csv")
-    assert record is not None
     assert record.recordings["units"] == {"score": "percent", "angle": "deg"}
 
     judge = ("evaluate", "file", "tracks.csv", "--truth", "gt.parquet")

@@ -56,7 +56,6 @@ def page_of(runs: dict[str, TrackedScene], **more: Any) -> str:
 
 def data_of(page: str) -> Any:
     packed = re.search(r'<script id="data" type="text/plain">(.*?)</script>', page)
-    assert packed is not None
     return json.loads(zlib.decompress(base64.b64decode(packed[1])))
 
 
@@ -78,7 +77,6 @@ def test_rows_are_the_tracks_in_centimetres_about_the_start(runs):
         np.testing.assert_allclose(table[:, 10] / 1e4, tracks.position_covariance[:, 0, 0], atol=1e-4)
         np.testing.assert_allclose(table[:, 13] / 1000, tracks.coasting, atol=0.001)
     truth = run.scene.ground_truth
-    assert truth is not None
     assert [row[6] for row in data["truth"][-1]] == truth[-1].visible.astype(int).tolist()
     taken = sum(frame.timestamp <= run.scene.timestamps[-1] + 1e-6 for frame in run.scene.frames)
     boxes = sum(len(frame) for frame in run.scene.frames[:taken])

@@ -108,7 +108,7 @@ def tried(script: str, folder: Path, hash_: str = ""):
     return found
 
 
-def test_weak_brief_and_unseen_tracks_are_hidden_until_asked_for(tmp_path):
+def test_weak_brief_and_unseen_tracks_are_hidden_until_asked_for_and_classes_switched_off_or_shown_alone(tmp_path):
     found = tried(
         """
   at(5); found.first = counts();
@@ -119,6 +119,13 @@ def test_weak_brief_and_unseen_tracks_are_hidden_until_asked_for(tmp_path):
   found.score = score.value;
   score.value = 0; score.oninput(); found.weak = counts();
   score.value = .75; score.oninput(); found.strong = counts();
+  score.value = .3; score.oninput(); at(5);
+  found.chips = [...$of("classes").children].map(each => each.textContent);
+  found.colours = [...$of("classes").children].map(each => getComputedStyle(each).backgroundColor);
+  chip("car").click(); found.walkers = counts(); found.pressed = chip("car").getAttribute("aria-pressed");
+  chip("car").click(); found.all = counts();
+  chip("pedestrian").ondblclick(); found.alone = counts();
+  chip("pedestrian").ondblclick(); found.again = counts();
 """,
         tmp_path,
     )
@@ -129,6 +136,10 @@ def test_weak_brief_and_unseen_tracks_are_hidden_until_asked_for(tmp_path):
     assert found["brief"] == "5"
     assert found["weak"] == "5"
     assert found["strong"] == "3"  # car-1, car-2, ghost-6
+    assert found["chips"] == ["car", "pedestrian"]
+    assert len(set(found["colours"])) == 2
+    assert (found["walkers"], found["pressed"], found["all"]) == ("1", "false", "3")
+    assert (found["alone"], found["again"]) == ("1", "3")
 
 
 def test_the_page_starts_at_the_fullest_moment_with_its_tracks_drawn(tmp_path):
@@ -160,43 +171,6 @@ def test_a_class_has_one_colour_in_player_charts_and_figures(tmp_path):
     for name, colour in class_colours(["bollard", "pedestrian"]).items():
         assert found[name] == [colour, f"rgb({', '.join(map(str, bytes.fromhex(colour[1:])))})"]
     assert found["all"][0] not in (found["bollard"][1], found["pedestrian"][1])
-
-
-def test_keys_work_after_a_click_on_a_control(tmp_path):
-    found = tried(
-        """
-  const on = (id, name) => $of(id).dispatchEvent(new KeyboardEvent("keydown", {key: name, bubbles: true}));
-  at(5); $of("show-ids").click(); on("show-ids", "ArrowRight"); found.box = $of("clock").value;
-  on("play", "ArrowRight"); found.button = $of("clock").value;
-  on("time", "ArrowRight"); found.slider = $of("clock").value;
-  on("time", "n"); found.followed = followed();
-  on("show-ids", " "); found.playing = $of("play").textContent;
-""",
-        tmp_path,
-    )
-    assert (found["box"], found["button"]) == ("3.0 s", "3.5 s")
-    assert found["slider"] == "3.5 s"  # the slider moves itself
-    assert found["followed"] == "track car-1"
-    assert found["playing"] == "Play"  # space is the check box's
-
-
-def test_classes_can_be_switched_off_or_shown_alone(tmp_path):
-    found = tried(
-        """
-  at(5);
-  found.chips = [...$of("classes").children].map(each => each.textContent);
-  found.colours = [...$of("classes").children].map(each => getComputedStyle(each).backgroundColor);
-  chip("car").click(); found.walkers = counts(); found.pressed = chip("car").getAttribute("aria-pressed");
-  chip("car").click(); found.all = counts();
-  chip("pedestrian").ondblclick(); found.alone = counts();
-  chip("pedestrian").ondblclick(); found.again = counts();
-""",
-        tmp_path,
-    )
-    assert found["chips"] == ["car", "pedestrian"]
-    assert len(set(found["colours"])) == 2
-    assert (found["walkers"], found["pressed"], found["all"]) == ("1", "false", "3")
-    assert (found["alone"], found["again"]) == ("1", "3")
 
 
 def test_a_link_leads_to_a_moment_and_a_track(tmp_path):
@@ -239,10 +213,14 @@ def test_two_results_side_by_side(tmp_path):
     assert found["picked"] == [["track car-1", "car-1"]] * 2
 
 
-def test_the_view_fits_what_is_shown_and_a_class_alone_fills_it(tmp_path):
+def test_the_view_fits_what_is_shown_and_the_scale_bar_is_as_long_as_it_says(tmp_path):
     found = tried(
         """
-  const view = $of("view"), inside = places => places.every(([ahead, aside]) => {
+  const view = $of("view"), g = view.getContext("2d"), low = view.clientHeight - 14;
+  const dark = x => g.getImageData(x, low, 1, 1).data[3] > 128;
+  const end = Math.floor(14 + view.dataset.step * view.dataset.zoom);
+  found.bar = [dark(15), dark(end - 2), dark(end + 4)];
+  const inside = places => places.every(([ahead, aside]) => {
     const [x, y] = pixel(ahead, aside, view.clientWidth);
     return x > 0 && y > 0 && x < view.clientWidth && y < view.clientHeight;
   });
@@ -267,16 +245,7 @@ def test_the_view_fits_what_is_shown_and_a_class_alone_fills_it(tmp_path):
     step, squares = found["scale"]
     assert step / 10 ** np.floor(np.log10(step)) in (1, 2, 5)
     assert 2 <= squares <= 7
-
-
-def test_the_scale_bar_is_as_long_as_it_says(tmp_path):
-    script = """
-  const view = $of("view"), g = view.getContext("2d"), low = view.clientHeight - 14;
-  const dark = x => g.getImageData(x, low, 1, 1).data[3] > 128;
-  const end = Math.floor(14 + view.dataset.step * view.dataset.zoom);
-  found.bar = [dark(15), dark(end - 2), dark(end + 4)];
-"""
-    assert tried(script, tmp_path)["bar"] == [True, True, False]
+    assert found["bar"] == [True, True, False]
 
 
 def judged() -> ReportScene:
@@ -386,10 +355,16 @@ def test_relations_have_the_names_of_their_rules(tmp_path):
     assert "Admires" in found["facts"]
 
 
-def test_keys_and_their_help(tmp_path):
+def test_keys_and_their_help_also_after_a_click_on_a_control(tmp_path):
     found = tried(
         """
-  at(5);
+  const on = (id, name) => $of(id).dispatchEvent(new KeyboardEvent("keydown", {key: name, bubbles: true}));
+  at(5); $of("show-ids").click(); on("show-ids", "ArrowRight"); found.box = $of("clock").value;
+  on("play", "ArrowRight"); found.button = $of("clock").value;
+  on("time", "ArrowRight"); found.slider = $of("clock").value;
+  on("time", "n"); found.followed = followed();
+  on("show-ids", " "); found.playing = $of("play").textContent;
+  key("Escape"); at(5);
   key("n"); found.next = followed();
   key("n"); found.other = followed();
   key("p"); found.back = followed();
@@ -402,7 +377,10 @@ def test_keys_and_their_help(tmp_path):
 """,
         tmp_path,
     )
-    assert found["next"] == "track car-1"  # the nearest
+    assert (found["box"], found["button"]) == ("3.0 s", "3.5 s")
+    assert found["slider"] == "3.5 s"  # the slider moves itself
+    assert found["playing"] == "Play"  # space is the check box's
+    assert found["followed"] == found["next"] == "track car-1"  # the nearest
     assert found["other"] != found["back"] == found["next"]
     assert found["none"] == ""
     assert (found["more"], found["less"]) == ("0.35", "0.3")

@@ -456,7 +456,6 @@ def test_points_of_the_lidar_beside_a_box(server):
 def test_the_command_serves_until_it_is_interrupted(labels):
     options = [*COMMAND, "review", str(labels), "--who", "anna"]
     command = subprocess.Popen(options, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert command.stdout is not None
     url = urlsplit(command.stdout.readline().strip())
     assert url.hostname == "127.0.0.1"
     with urlopen(url.geturl(), timeout=60) as page:

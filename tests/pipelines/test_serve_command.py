@@ -142,7 +142,6 @@ def test_kernels_are_there_before_the_service_listens():
     command = [sys.executable, "-c", patched, "serve", "--listen", "127.0.0.1:0"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as server:
         try:
-            assert server.stderr is not None
             assert server.stderr.readline().strip() == "kernels loaded"
             assert server.stderr.readline().startswith("listening at ")
         finally:
@@ -205,12 +204,9 @@ def test_a_pipe_ends_with_what_came_in(tmp_path, number, code):
     command = [*COMMAND, "serve", "--reorder", "0.5", "--snapshot", str(state)]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe) as server:
-        assert server.stdin is not None
-        assert server.stdout is not None
         server.stdin.write(b"".join(map(frame, range(4))) + frame(4)[:10])
         server.stdin.flush()
         assert [json.loads(server.stdout.readline())["type"] for _ in range(4)] == ["held"] * 4
-        assert server.stderr is not None
         server.send_signal(number)
         out, errors = server.stdout.read(), server.stderr.read()
     assert server.returncode == code
@@ -223,7 +219,6 @@ def test_a_pipe_whose_reader_sleeps_ends_too_and_keeps_its_state(tmp_path):
     read, write = os.pipe()
     command = [*COMMAND, "serve", "--snapshot", str(tmp_path / "state"), "--every", "3600"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=write, stderr=subprocess.PIPE) as server:
-        assert server.stdin is not None
         asks = b'{"type": "status"}\n'
         server.stdin.write(frame(0) + frame(1))
         server.stdin.flush()

@@ -83,7 +83,7 @@ def test_unfinished_lines_of_all_clients_share_a_budget():
         # the good client has the shortest unfinished line, and keeps it
         good.send(frame(1)[:20])
         before = memory(server.pid)
-        hogs = [stack.enter_context(connected(address)) for _ in range(200)]
+        hogs = [stack.enter_context(connected(address)) for _ in range(100)]
         peak = 0.0
         for hog in hogs:
             with suppress(OSError):  # closed by the service
@@ -92,7 +92,7 @@ def test_unfinished_lines_of_all_clients_share_a_budget():
         good.send(frame(1)[20:])
         assert good.receive()["type"] == "tracks"
         closed = good.ask({"type": "status"})["closed"]["memory"]
-        assert closed >= 180
+        assert closed >= 80
         assert peak - before < 250
         assert sum(b"unfinished lines" in received(hog) for hog in hogs) > 0
 

@@ -176,14 +176,11 @@ def test_fixes_are_placed_where_the_recording_begins(tmp_path: Path) -> None:
     )
     table.write_text("time [s],latitude [deg],longitude [deg],altitude [m]\n0.5,49.0001,8.4,103\n0.6,49.0002,8.4,103\n")
     log = sensor_log(recording, "", [f"gps={table}"])
-    assert log is not None
     np.testing.assert_allclose(log.tables["gps"][:, 1:], [[0, 11.132, 3], [0, 22.264, 3]], rtol=1e-3, atol=1e-6)
     of_map = (49.001, 8.4, 90.0)  # 111 m north of the records, 10 m below
     log = sensor_log(recording, "", [f"gps={table}"], None, lambda: of_map)
-    assert log is not None
     np.testing.assert_allclose(log.tables["gps"][:, 1:], [[0, -100.19, 13], [0, -89.06, 13]], rtol=1e-3, atol=1e-6)
     from_records = sensor_log(recording, "gps", [], None, lambda: of_map)
-    assert from_records is not None
     np.testing.assert_allclose(from_records.tables["gps"][:, 1:].mean(axis=0), [0, -111.32, 10], atol=2.0)
 
 

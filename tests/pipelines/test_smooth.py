@@ -115,7 +115,6 @@ def test_an_object_keeps_size_class_and_score_and_has_no_holes(smoothed):
 
 def test_smoothed_positions_and_headings_are_better_than_online_ones(smoothed):
     ((scene, _),) = smoothed.parts
-    assert scene.ground_truth is not None
     online = track_scene(scene, load_smooth_config("simulated").tracking.new_tracker("saga")).tracks
     errors: list[list[float]] = []
     runs = [(moments, match_scene(scene.ground_truth, moments)) for moments in (online, smoothed.tracks)]

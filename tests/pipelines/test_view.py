@@ -159,7 +159,6 @@ def test_scans_of_nuscenes_are_found_where_their_files_are(tmp_path):
     (root / "samples" / "LIDAR_TOP").mkdir(parents=True)
     np.array([[1, 2, 3, 0.5, 7]], dtype="<f4").tofile(root / "samples" / "LIDAR_TOP" / "a1.pcd.bin")
     scans = nuscenes_scans(root, root / VERSION, "scene-0103")
-    assert scans is not None
     assert len(scans) == 1
     assert scans[0].points.tolist() == [[1, 2, 3]]
     assert scans.world_T_ego[0, :3, 3].tolist() == [5, 0, 0]
@@ -340,7 +339,6 @@ def test_tracks_truth_and_ego_are_where_the_result_has_them(tmp_path, shown):
     determinant = np.linalg.det(table.position_covariance[rows])
     np.testing.assert_allclose(spread, 4 * 2 * np.log(10) * np.sqrt(determinant), rtol=0.02)
     assert all(len(line.points) == 2 for line in layer("edges", "lines"))
-    assert scene.ground_truth is not None
     seen, hidden = (topics[f"{ROOT}/truth/{name}"][k].content.entities for name in ("seen", "hidden"))
     truth = scene.ground_truth[k]
     assert [entity.id for entity in seen] == truth.id[truth.visible].tolist()

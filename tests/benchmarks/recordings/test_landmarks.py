@@ -218,7 +218,6 @@ def test_ranges_to_beacons_are_read(tmp_path):
     assert drive.pose.tolist() == [1, 1]
     assert drive.landmark.tolist() == [7, 3]
     np.testing.assert_array_equal(drive.value[:, 0], [30.5, 12.0])
-    assert drive.truth is not None
     np.testing.assert_allclose(drive.truth.positions[1], [3, 4, 0])
     assert {k: v.tolist() for k, v in drive.places.items()} == {7: [20, 30], 3: [-1, -2]}
 

@@ -83,7 +83,6 @@ def test_ground_truth_alone_has_everybody_and_no_frames(traffic):
     scene = true_scene(traffic)
     assert not scene.frames
     assert visible(scene) == {"1": 1.0, "2": 1.0, "3": 1.0}
-    assert scene.ground_truth is not None
     assert [len(truth) for truth in scene.ground_truth] == [2] * 5 + [3] * 7
 
 
@@ -171,7 +170,6 @@ def test_track_and_evaluate(data):
 def test_scenes_to_learn_from_have_the_carrier_as_well(data):
     source = Ngsim(dataroot=str(data / "ngsim"), viewpoint="1")
     scene = scenes_to_learn_from(source, load_config("traffic"), with_truth=True)["A"]
-    assert scene.ground_truth is not None
     ids = [name for moment in scene.ground_truth for name in moment.id.tolist()]
     assert [ids.count(name) for name in ("1", "2", "3")] == [20, 20, 15]
     assert [len(frame) for frame in scene.frames] == [len(moment) for moment in scene.ground_truth]

@@ -46,7 +46,6 @@ def test_every_moment_has_a_frame(root):
 
 def test_ground_truth(root):
     truth = KittiTracking(root, ground_truth=True).scene("0007").ground_truth
-    assert truth is not None
     assert [moment.id.tolist() for moment in truth] == [["4"], ["4"], ["4", "5"]]
     assert truth[2].boxes.label.tolist() == ["car", "person_sitting"]
     assert [moment.visible.tolist() for moment in truth] == [[True], [True], [False, False]]

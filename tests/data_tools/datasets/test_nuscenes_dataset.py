@@ -90,7 +90,6 @@ def test_sample_that_is_not_listed_gets_no_frame_and_one_warning(tmp_path, caplo
 
 def test_ground_truth(tmp_path):
     truth = dataset(tmp_path, ground_truth=True).scene("scene-0103").ground_truth
-    assert truth is not None
     assert [moment.id.tolist() for moment in truth] == [["i-car", "i-ped"], ["i-car"], ["i-car", "i-ped"]]
     assert truth[0].boxes.label.tolist() == ["car", "pedestrian"]
     assert [moment.visible.tolist() for moment in truth] == [[True, True], [False], [True, True]]
@@ -107,7 +106,6 @@ def test_no_velocity_over_a_long_gap(tmp_path):
         sample["timestamp"] = START + 1_600_000 * k
     content["sample"][1]["timestamp"] -= 200_000  # 1.4 s and 1.8 s: one side too long, 3.2 s over both
     truth = dataset(tmp_path, content, ground_truth=True).scene("scene-0103").ground_truth
-    assert truth is not None
     known = [np.isfinite(moment.boxes.velocity[:, 0]).tolist() for moment in truth]
     assert known == [[True, False], [False], [False, False]]
 

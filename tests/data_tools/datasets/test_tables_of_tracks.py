@@ -191,7 +191,6 @@ def test_nuscenes_tables_of_labels_are_read_as_a_dataset(tmp_path):
     write_nuscenes_labels(tmp_path / "labels", tmp_path / "data", "v1.0-mini", [(scene, moments)])
 
     truth = NuScenes(tmp_path / "labels", "v1.0-mini", detections, ground_truth=True).scene("scene-0001").ground_truth
-    assert truth is not None
     assert [len(moment) for moment in truth] == [len(moment) for moment in moments]
     assert np.allclose(truth[1].boxes.position[0], moments[1].tracks.boxes.position[0], atol=1e-6)
     assert np.allclose(truth[1].boxes.size[0], [4.5, 1.9, 1.6])
