@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -13,7 +12,8 @@ import numpy as np
 import typer
 from scipy.spatial import cKDTree
 
-from benchmarks.loops import FALSE, drive_course
+from benchmarks.course import SimulatedCourse, revisits
+from benchmarks.loops import FALSE, PERIOD
 from benchmarks.runner import Row, Rows, in_turn
 from data_tools.datasets.kitti import kitti_scans
 from data_tools.lidar import (
@@ -36,7 +36,7 @@ from saga_fg.numerics import FloatArray, inverse_transform, transform_points, ya
 
 _MAP, _SCAN, _SURFEL = 0.25, 1.5, 1.0  # m: spacings and voxels of LiDAR odometry
 _BEFORE, _EVERY = 12, 5  # scans that make a map, and steps between those compared
-_APART, _NEAR = 60.0, 10.0  # m of way between submaps of one place, and between their middles
+_APART, _AROUND = 60.0, 8  # m of way between submaps of one place; scans of them before and after their middle
 OURS = "saga-fg"
 T = TypeVar("T")
 _Pair = tuple[FloatArray, FloatArray]
@@ -192,19 +192,25 @@ def _patches(cloud: Any) -> Any:
 
 
 def _places(seed: int) -> tuple[list[_Pair], list[FloatArray]]:
-    """Points (N, 3) of two submaps that show one place, of all such of a drive, and the second one's true pose."""
-    course, result = drive_course(seed)
+    """Points (N, 3) of two submaps of each stretch that a course drives again, and the second one's true pose."""
+    course = SimulatedCourse(seed, period=PERIOD, skewed=False)
+    lidar = course.world_T_ego @ course.ego_T_lidar
     pairs, truths = list[_Pair](), list[FloatArray]()
-    lidar = course.world_T_ego[result.keyframes] @ course.ego_T_lidar
-    frames = [one.frame(lidar) for one in result.submaps]
-    middles = [
-        transform_points(T, one.points.mean(axis=0)[None])[0] for T, one in zip(frames, result.submaps, strict=True)
-    ]
-    for (a, old), (b, new) in combinations(enumerate(result.submaps), 2):
-        if new.travelled[0] - old.travelled[1] > _APART and np.linalg.norm(middles[a] - middles[b]) < _NEAR:
-            pairs.append((old.points.astype(np.float64), new.points.astype(np.float64)))
-            truths.append(inverse_transform(frames[a]) @ frames[b])
+    for start, end in revisits(course.world_T_ego):
+        new = (start + end) // 2
+        before = np.flatnonzero(course.distance < course.distance[new] - _APART)
+        old = int(before[np.linalg.norm(lidar[before, :2, 3] - lidar[new, :2, 3], axis=1).argmin()])
+        pairs.append((_submap(course, lidar, old), _submap(course, lidar, new)))
+        truths.append(inverse_transform(lidar[old]) @ lidar[new])
     return pairs, truths
+
+
+def _submap(course: SimulatedCourse, lidar: FloatArray, row: int) -> FloatArray:
+    """Points (N, 3) of the scans around a row, in its frame."""
+    inverse = inverse_transform(lidar[row])
+    around = range(max(0, row - _AROUND), min(len(course), row + _AROUND + 1))
+    points = np.concatenate([transform_points(inverse @ lidar[k], course[k].points) for k in around])
+    return points[voxel_downsample(points, _MAP)]
 
 
 def _aligned(pair: _Pair) -> FloatArray:

@@ -1,10 +1,9 @@
 """The vehicle and the objects around it in one graph, against one after the other, with poor odometry.
 
 Decoupled: the odometry's path, and the tracker along it. Joint: odometry and objects in one graph. Held: objects by the
-same graph, with past and future, the path held where the odometry has it. Online, joint is the tracker that estimates
-the vehicle's pose with its tracks (`ego.estimated`, `saga_fg.providers:Odometry` with the errors of the device), read
-out at every frame, and follow a tracker along the path that it finds. All know the same odometry, degraded by errors
-sampled with a seed. Paths are aligned with the true one before their absolute trajectory error (ATE) is taken.
+same graph, with past and future, the path held where the odometry has it. Online, joint is the tracker along
+`saga_fg.slam.joint.OnlinePath`, read out at every frame. All know the same odometry, degraded by errors sampled with a
+seed. Paths are aligned with the true one before their absolute trajectory error (ATE) is taken.
 
 A pair is an object at a frame, with a detection within `NEAR` of the truth along the true path, of a track that has
 detected it in at least `SETTLED` frames before: earlier, velocities are the priors of new tracks. Contenders are
@@ -37,19 +36,16 @@ from pipelines.config import TrackConfig, load_config
 from pipelines.slam.lidar_slam import path_tracker
 from saga_fg.errors import InputError
 from saga_fg.graph import EGO_POSE, Additions, GraphView
-from saga_fg.numerics import Assignment, FloatArray, IntArray, assign, yaw_of
-from saga_fg.providers import Odometry, OdometryNoise, StartSettings
-from saga_fg.slam.joint import JointSettings, OdometryIncrements, estimate_jointly
+from saga_fg.numerics import Assignment, FloatArray, IntArray, assign
+from saga_fg.providers import OdometryNoise
+from saga_fg.slam.joint import JointSettings, OdometryIncrements, OnlinePath, estimate_jointly
 from saga_fg.slam.joint.graph import ObjectStates
 from saga_fg.slam.joint.record import KEYFRAME_PERIOD, in_ego
-from saga_fg.tracking import EgoNodeSettings, Tracker
 from saga_fg.types import (
     Annotations,
     Boxes,
     Detections,
-    EgoMeasurements,
     Frame,
-    OdometryIncrement,
     Scene,
 )
 
@@ -71,9 +67,7 @@ def joint(
     ] = None,
     scenes: Annotated[int, typer.Option("--scenes", min=2, help="Simulated scenes.")] = 10,
     seeds: Annotated[int, typer.Option("--seeds", min=1, help="Samples of the odometry's errors per recording.")] = 1,
-    online: Annotated[
-        str, typer.Option("--online", help="Frame by frame, by this estimator: isam2 or fixed-lag.", metavar="NAME")
-    ] = "",
+    online: Annotated[bool, typer.Option("--online", help="Frame by frame.")] = False,
     config: Config = None,
 ) -> Rows:
     """Joint against decoupled estimation with degraded odometry: errors of the path and of the objects.
@@ -85,7 +79,7 @@ def joint(
     Examples:
       python -m benchmarks joint --scenes 10
       python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --seeds 10
-      python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --online isam2
+      python -m benchmarks joint --dataroot data/kitti --detections data/kitti/detections/pointrcnn --online
     """
     if (dataroot is None) != (detections is None):
         raise InputError("expected both --dataroot and --detections, or neither")
@@ -95,7 +89,7 @@ def joint(
         found = KittiTracking(dataroot, detections, None, True)
         many = [found.scene(name) for name in found.scenes]
     base = load_config("simulated" if dataroot is None else "kitti", config)
-    run = partial(online_run, estimator=online) if online else batch_run
+    run = online_run if online else batch_run
     yield from joint_rows(many, range(seeds), partial(run, config=base, settings=JointSettings()))
 
 
@@ -113,7 +107,7 @@ class Outcome:
         self.paths[name], self.figures[column] = np.array([error**2 * poses, poses]), error
 
 
-OBJECTS = (("joint", "decoupled"), ("joint", "held"), ("joint", "follow"))
+OBJECTS = (("joint", "decoupled"), ("joint", "held"))
 
 
 def joint_rows(scenes: Sequence[Scene], seeds: Sequence[int], run: Callable[..., Outcome]) -> Iterator[Row]:
@@ -216,39 +210,31 @@ def batch_run(scene: Scene, seed: int, config: TrackConfig, settings: JointSetti
     return outcome
 
 
-def online_run(scene: Scene, seed: int, config: TrackConfig, settings: JointSettings, estimator: str) -> Outcome:
+def online_run(scene: Scene, seed: int, config: TrackConfig, settings: JointSettings) -> Outcome:
     """Frame by frame. Raises `InputError` for a scene without ground truth."""
     if scene.ground_truth is None:
         raise InputError(f"scene {scene.name}: expected ground truth")
     frames, path, odometry = degraded_drive(scene, settings, SENSOR, seed)
     driven, outcome = odometry.path(path.world_T_ego[0]), Outcome()
-    dt, a_T_b = [1.0, *odometry.dt.tolist()], [np.eye(4), *odometry.a_T_b]
-    alone, follower = path_tracker(config), path_tracker(config)
-    x, y, _ = path.world_T_ego[0, :3, 3].tolist()
-    start = (x, y, float(yaw_of(path.world_T_ego[0, :3, :3])))
-    first = StartSettings(start, deviation=1e-3, heading_deviation=1e-3, tilt_deviation=1e-3, planar=False)
-    joined = Tracker(
-        replace(config.tracker, estimator=estimator, ego=EgoNodeSettings(estimated=True)),
-        config.sensors,
-        providers=[Odometry(first, errors=settings.odometry)],
-    )
-    newest = list[FloatArray]()
+    a_T_b = [np.eye(4), *odometry.a_T_b]
+    alone, joined = path_tracker(config), path_tracker(config)
+    online, newest, aside = OnlinePath(joined, settings, driven[0]), list[FloatArray](), list[bool]()
 
     def at(k: int, frame: Frame, found: Detections) -> dict[str, State]:
-        measured = EgoMeasurements(odometry=OdometryIncrement(a_T_b[k], dt[k]))
-        now = joined.step(Frame(frame.timestamp, frame.sensor, found, None, "ego", ego=measured))
-        assert joined.world_T_ego is not None
-        newest.append(joined.world_T_ego)
-        states = {"joint": (now.id, _planar(now.boxes), newest[-1], joined.assignment)}
-        for name, tracker, pose in (("decoupled", alone, driven[k]), ("follow", follower, newest[-1])):
-            now = tracker.step(Frame(frame.timestamp, frame.sensor, found, pose, "ego"))
-            states[name] = now.id, _planar(now.boxes), pose, tracker.assignment
-        return states
+        decoupled = alone.step(Frame(frame.timestamp, frame.sensor, found, driven[k], "ego"))
+        joint = online.step(frame, a_T_b[k])
+        newest.append(online.world_T_ego)
+        aside.append(online.aside)
+        return {
+            "decoupled": (decoupled.id, _planar(decoupled.boxes), driven[k], alone.assignment),
+            "joint": (joint.id, _planar(joint.boxes), newest[-1], joined.assignment),
+        }
 
     outcome.objects = object_sums(scene, frames, path.world_T_ego, config, at)
     for name, poses in (("decoupled", driven), ("joint", np.stack(newest))):
         ate = trajectory_errors(Trajectory(path.timestamps, poses), path).ate
         outcome.add_path(name, f"ATE, m: {name}", ate, len(frames))
+    outcome.figures["share aside"] = float(np.mean(aside))
     return outcome
 
 

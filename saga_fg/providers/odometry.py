@@ -1,4 +1,4 @@
-"""Providers of the vehicle's own motion: first pose, and odometry, with its slow errors where these are estimated.
+"""Providers of the vehicle's own motion: first pose, and odometry; and the noise of odometry with slow errors.
 
 The vehicle's pose from epoch to epoch, by odometry.
 
@@ -7,8 +7,8 @@ The vehicle's pose from epoch to epoch, by odometry.
 An increment over other times than the epoch's is taken for a steady motion, of which the epoch has its share: the
 motion's logarithm times the share, its covariance as well. Without an increment the vehicle may be anywhere nearby.
 
-A device with slow errors, a scale of the distance, a bias of the yaw rate and an angle of the course, has these as
-variables of their own (`factors.odometry_factors`). An increment of dt s and d m has independent noise
+A device has slow errors, a scale of the distance, a bias of the yaw rate and an angle of the course, which the joint
+estimate has as variables of their own (`factors.odometry_factors`). An increment of dt s and d m has independent noise
 
     heading      turn_noise^2 dt                     roll, pitch   tilt_noise^2 dt
     translation  distance_noise^2 d + time_noise^2 dt,  every direction
@@ -25,9 +25,9 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from factors import ERROR_DIM, Pose, between_factor, odometry_factors, pose, pose_prior_factor, prior_factor
-from saga_fg.errors import InputError, require_type
-from saga_fg.graph import EGO_ERROR, EGO_POSE, Additions, GraphView, NewVariable
+from factors import ERROR_DIM, Pose, between_factor, pose, pose_prior_factor
+from saga_fg.errors import InputError
+from saga_fg.graph import EGO_POSE, Additions, GraphView, NewVariable
 from saga_fg.numerics import FloatArray, yaw_of, yaw_transform
 from saga_fg.settings import Positive, Settings, setting, settings_group
 from saga_fg.types import Frame, OdometryIncrement
@@ -143,10 +143,7 @@ UNKNOWN_TURN = 0.3  # standard deviation of the turn rate where there is no incr
 
 @dataclass(frozen=True)
 class Odometry(Settings):
-    """Adds the vehicle's pose at every epoch, and the increments of odometry (`frame.ego.odometry`).
-
-    Raises `InputError` for `errors` with poses in the plane.
-    """
+    """Adds the vehicle's pose at every epoch, and the increments of odometry (`frame.ego.odometry`)."""
 
     start: StartSettings = settings_group(StartSettings, "first pose")
     place_drift: Positive = setting(
@@ -155,61 +152,24 @@ class Odometry(Settings):
     heading_drift: Positive = setting(
         0.01, "standard deviation of heading, roll and pitch after one second, likewise, rad"
     )
-    errors: OdometryNoise | None = settings_group(
-        lambda: None, "noise of a device whose slow errors are estimated, of poses in space; null: none are"
-    )
     name = "odometry"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.errors is not None:
-            require_type("errors", self.errors, OdometryNoise)
-            if self.start.planar:
-                raise InputError("errors: expected poses in space, start.planar: false")
 
     def predict(self, view: GraphView) -> Additions:
         before = view.before(EGO_POSE)
         if not before:
-            return self._begun(view)
+            return self.start.additions(view)
         last, key = before[0].key, view.key(EGO_POSE, 0)
         planar = isinstance(view.state(last), gtsam.Pose2)
         motion, covariance = self._motion(view, planar)
-        if self.errors is not None:
-            return self._with_errors(view, self.errors, motion.matrix(), covariance)
-        assert covariance is not None
-        new = self._new_pose(view, view.state(last).compose(motion))
+        state = view.state(last).compose(motion)
+        new = [] if view.now(EGO_POSE) else [NewVariable(EGO_POSE, 0, state, label="vehicle")]
         return Additions(new, [between_factor(last, key, motion.matrix(), covariance)])
-
-    @staticmethod
-    def _new_pose(view: GraphView, state: Pose) -> list[NewVariable]:
-        """The pose, unless another provider has added it."""
-        return [] if view.now(EGO_POSE) else [NewVariable(EGO_POSE, 0, state, label="vehicle")]
 
     def factors(self, view: GraphView) -> Additions:
         return Additions()
 
-    def _begun(self, view: GraphView) -> Additions:
-        """The first pose, with the errors where they are estimated."""
-        first = self.start.additions(view)
-        if self.errors is None:
-            return first
-        errors = NewVariable(EGO_ERROR, 0, np.zeros(ERROR_DIM))
-        prior = prior_factor(view.key(EGO_ERROR, 0), errors.state, np.diag(np.square(self.errors.slow)))
-        return Additions([*first.variables, errors], [*list(first.factors), prior])  # type: ignore[arg-type]
-
-    def _with_errors(
-        self, view: GraphView, noise: OdometryNoise, a_T_b: FloatArray, covariance: FloatArray | None
-    ) -> Additions:
-        last, slow = view.before(EGO_POSE)[0].key, view.before(EGO_ERROR)[0].key
-        errors, dt = np.asarray(view.state(slow)), np.array([view.dt])
-        pose = view.state(last).compose(gtsam.Pose3(without_errors(a_T_b, errors, view.dt)))
-        new = [*self._new_pose(view, pose), NewVariable(EGO_ERROR, 0, errors)]
-        rows = np.array([[last, view.key(EGO_POSE, 0), slow, view.key(EGO_ERROR, 0)]], dtype=np.uint64)
-        P = noise.of_increments(a_T_b[None], dt, [covariance])
-        return Additions(new, [odometry_factors(rows, a_T_b[None], dt, P)])
-
-    def _motion(self, view: GraphView, planar: bool) -> tuple[Pose, FloatArray | None]:
-        """Motion of this epoch, with the covariance of its tangent; None where that of `errors` holds."""
+    def _motion(self, view: GraphView, planar: bool) -> tuple[Pose, FloatArray]:
+        """Motion of this epoch, with the covariance of its tangent."""
         ego = None if view.frame is None else view.frame.ego
         if ego is None or ego.odometry is None:
             stationary: Pose = gtsam.Pose2() if planar else gtsam.Pose3()
@@ -217,14 +177,13 @@ class Odometry(Settings):
         reported = ego.odometry
         motion = _motion_of(reported, planar)
         covariance = reported.covariance
-        if covariance is None and self.errors is None:
+        if covariance is None:
             covariance = self._covariance(self.place_drift, self.heading_drift, planar) * reported.dt
         share = view.dt / reported.dt
         if abs(share - 1) <= _SAME:
             return motion, covariance
         still: Any = type(motion)()
-        scaled = None if covariance is None else share * max(share, 1.0) * covariance
-        return still.expmap(share * still.logmap(motion)), scaled
+        return still.expmap(share * still.logmap(motion)), share * max(share, 1.0) * covariance
 
     def _covariance(self, place: float, heading: float, planar: bool) -> FloatArray:
         sigmas = [place, place, heading] if planar else 3 * [heading] + 3 * [place]

@@ -73,8 +73,8 @@ from saga_fg.slam.mapping import pose_key
 from saga_fg.tracking import Tracker
 from saga_fg.types import Frame
 
-_START_NOISE = 1e-3  # standard deviation of the first pose, m and rad
-_LIKELY = 0.9  # stationary with less than this probability: no such factor, since creeping queues are in doubt, too
+START_NOISE = 1e-3  # standard deviation of the first pose, m and rad
+LIKELY = 0.9  # stationary with less than this probability: no such factor, since creeping queues are in doubt, too
 _ANY_SPEED = 100.0  # m/s, deviation of an unknown velocity
 Record = Sequence[RecordedEpoch]
 STATIONARY_DRIFT = 0.05  # standard deviation of a stationary object's drift in one second, m
@@ -150,7 +150,7 @@ def stationary_factors(record: Record, stationary: Sequence[FloatArray]) -> list
     for (before, p_before), (now, p_now) in pairwise(zip(record, stationary, strict=True)):
         names, here, there = np.intersect1d(now.objects.id, before.objects.id, return_indices=True)
         p = np.minimum(p_now[here], p_before[there])
-        for row in np.flatnonzero(p > _LIKELY).tolist():
+        for row in np.flatnonzero(p > LIKELY).tolist():
             both = [object_key(epoch, int(names[row])) for epoch in (before.epoch, now.epoch)]
             rows.append((now.objects.types[here[row]], both, p[row], now.time - before.time))
     factors: list[ResidualFactors] = []
@@ -300,7 +300,7 @@ class VehicleAndObjects:
         if k == 0:
             errors = np.diag(np.square(self.settings.odometry.slow))
             factors.append(prior_factor(error_key(k), np.zeros(ERROR_DIM), errors))
-            factors.append(pose_prior_factor(pose_key(k), pose, _START_NOISE**2 * np.eye(6)))
+            factors.append(pose_prior_factor(pose_key(k), pose, START_NOISE**2 * np.eye(6)))
         if row + 1 == len(self.record):
             factors += odometry(self.record, self.settings)
             factors += detections(self.record, self.settings)

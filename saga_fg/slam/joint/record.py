@@ -180,7 +180,7 @@ class RecordedEpoch:
 
 
 class EpochRecorder:
-    """Record one frame after the other with a tracker."""
+    """Record one frame after the other with a tracker; `tracks`: what it says of the newest."""
 
     def __init__(self, tracker: Tracker) -> None:
         self._tracker = tracker
@@ -199,7 +199,7 @@ class EpochRecorder:
             raise InputError(f"frame at {frame.timestamp:.6f} s: expected one after {last.time:.6f} s")
         detections = in_ego(frame, tracker.sensor(frame.sensor))
         before = tracker.graph
-        tracker.step(Frame(frame.timestamp, frame.sensor, detections, world_T_ego, "ego"))
+        self.tracks = tracker.step(Frame(frame.timestamp, frame.sensor, detections, world_T_ego, "ego"))
         seen = self._seen(frame, detections)
         objects, transition = self._objects(seen), None
         if last is not None and tracker.graph is not None and tracker.graph is not before:

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from saga_fg import Boxes, Detections, Frame, InputError, Sensor, Tracker, TrackerSettings
-from saga_fg.graph import EGO_ERROR
 from saga_fg.model import CoordinatedTurn, NoiseModel, PoleLandmark
-from saga_fg.numerics import inverse_transform, transform_points, yaw_transform
-from saga_fg.providers import Landmarks, Odometry, OdometryNoise, StartSettings
+from saga_fg.numerics import inverse_transform, yaw_transform
+from saga_fg.providers import OdometryNoise
 from saga_fg.slam.joint import (
     JointSettings,
     OdometryIncrements,
+    OnlinePath,
     estimate_jointly,
 )
 from saga_fg.slam.joint.record import record_epochs, stationary_probabilities
 from saga_fg.slam.mapping import LandmarkObservations
-from saga_fg.tracking import AssociationSettings, ClassSettings, EgoNodeSettings
-from saga_fg.types import EgoMeasurements, Observation, OdometryIncrement
+from saga_fg.tracking import AssociationSettings, ClassSettings
+from saga_fg.types import Observation
 from tests.saga_fg.ego_drive import NOISE, drive, new_tracker
 
 POOR = OdometryNoise(scale=0.02, bias=0.005)
@@ -198,37 +198,41 @@ def test_poles_correct_the_odometry_where_nothing_else_stands():
 SETTINGS = JointSettings(POOR)
 
 
-def test_slow_errors_of_the_odometry_are_found_online():
-    """Posts beside the road tell the tracker that its wheels count too much."""
-    frames, odometry, poses, cars = drive(n=30, moving=0)
-    reported, noise = worse(odometry, np.random.default_rng(1), scale=0.06), replace(POOR, scale=0.06)
-    x, y, _ = poses[0, :3, 3].tolist()
-    start = StartSettings((x, y, 0.0), deviation=1e-3, heading_deviation=1e-3, tilt_deviation=1e-3, planar=False)
-    posts = Landmarks(labels=tuple(f"post {k}" for k in range(len(cars[0]))))
-    tracker = Tracker(
-        replace(new_tracker().settings, estimator="isam2", ego=EgoNodeSettings(estimated=True)),
-        new_tracker().sensors,
-        providers=[Odometry(start, errors=noise), posts],
-    )
-    for k, (frame, pose, places) in enumerate(zip(frames, poses, cars, strict=True)):
-        step = OdometryIncrement(reported.a_T_b[k - 1], reported.dt[k - 1]) if k else None
-        boxes = frame.detections.boxes
-        seen = transform_points(pose, boxes.position)[:, None, :2] - places
-        names = [f"post {post}" for post in np.linalg.norm(seen, axis=2).argmin(axis=1)]
-        detections = replace(frame.detections, boxes=replace(boxes, label=np.array(names)))
-        ego = EgoMeasurements(odometry=step)
-        tracker.step(replace(frame, detections=detections, world_T_ego=None, ego=ego))
-    off = off_path(np.stack([tracker.world_T_ego]), poses[-1:])[0]
-    assert off < off_path(reported.path(poses[0])[-1:], poses[-1:])[0] / 4
-    graph = tracker.running_graph
-    scale, bias, _ = graph.state(graph.of(EGO_ERROR, graph.epoch)[0].key)
-    assert scale == pytest.approx(0.06, abs=0.01)
-    assert bias == pytest.approx(-0.004, abs=0.004)
+def driven_online(frames, reported, poses, settings):
+    """The estimator after the frames, its poses, and whether it stepped aside at each."""
+    online, found = OnlinePath(new_tracker(), settings, poses[0]), []
+    for k, frame in enumerate(frames):
+        tracks = online.step(frame, reported.a_T_b[k - 1] if k else np.eye(4))
+        found.append((online.world_T_ego, online.aside))
+    assert len(tracks) > 4
+    return online, np.stack([pose for pose, _ in found]), np.array([aside for _, aside in found])
 
 
-def test_errors_need_poses_in_space():
-    with pytest.raises(InputError, match="errors: expected poses in space"):
-        Odometry(errors=POOR)
+def test_slow_errors_of_the_odometry_are_found_online(caplog):
+    frames, odometry, poses, _ = drive()
+    reported = worse(odometry, np.random.default_rng(1))
+    online, path, aside = driven_online(frames, reported, poses, SETTINGS)
+    assert not aside.any()
+    assert not caplog.messages
+    assert off_path(path, poses).max() < 0.7 * off_path(reported.path(poses[0]), poses).max()
+    deviations = online.covariance.diagonal() ** 0.5
+    np.testing.assert_array_less(np.abs(online.errors[:2] - [0.02, -0.004]), 3 * deviations[:2])
+
+
+def test_objects_that_contradict_the_odometry_leave_it_as_it_is(caplog):
+    """Odometry is exact, and what seems parked drifts as no odometry of such noise would make it."""
+    frames, odometry, poses, _ = drive(moving=0)
+    sure = JointSettings(OdometryNoise(scale=0.005, bias=0.001, course=0.001, course_drift=1e-5))
+    turned = [
+        replace(frame, detections=frame.detections.transformed(yaw_transform(yaw=0.01 * frame.timestamp)))
+        for frame in frames
+    ]
+    _, path, aside = driven_online(turned, odometry, poses, sure)
+    assert aside[-1]
+    assert len(caplog.messages) == (np.diff(aside.astype(int)) > 0).sum()
+    assert "stationary objects contradict its noise" in caplog.text
+    steps = inverse_transform(path[:-1]) @ path[1:]
+    np.testing.assert_allclose(steps[aside[:-1]], odometry.a_T_b[aside[:-1]], atol=1e-9)
 
 
 # Uncertain identity and motion of objects beside a vehicle whose path is estimated
