@@ -3,12 +3,15 @@
 import fcntl
 import json
 import os
+import secrets
+import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from importlib.machinery import ModuleSpec
 from pathlib import Path
@@ -36,7 +39,7 @@ from pipelines.scale_out import (
 from saga_fg.errors import InputError
 from saga_fg.types.dataset import Dataset
 from tests.pipelines.command import COMMAND, done, refused, saga_fg
-from tests.pipelines.scale_out_example import TRACK, Broken, Deadly, InThisProcess, content, write_recordings
+from tests.pipelines.scale_out_example import CONFIG, TRACK, Broken, Deadly, InThisProcess, content, write_recordings
 
 
 def run(inputs: list[Part], output: Path, task: SceneTask = TRACK, workers: int = 0) -> RunSummary:
@@ -78,6 +81,14 @@ def test_what_has_changed_is_done_again_and_nothing_else(tmp_path):
     assert report.done == ["a00", "a01", "a02", "a03"]
     after = content(output)
     assert {name for name in after if after[name] != expected[name]} == {"a03.csv"}
+
+
+def test_other_settings_or_another_method_do_everything_again(tmp_path):
+    inputs, output = write_recordings(tmp_path / "in", 2), tmp_path / "out"
+    run(inputs, output)
+    other = replace(CONFIG, tracker=replace(CONFIG.tracker, report_coasting=0.0))
+    for task in (replace(TRACK, settings=other), replace(TRACK, method="kf"), TRACK):
+        assert run(inputs, output, task).done == ["a00", "a01"]
 
 
 def test_the_manifest_says_how_a_result_came_about(tmp_path):
@@ -132,6 +143,18 @@ def test_a_scene_that_kills_every_worker_fails_alone(tmp_path):
     assert report.failed == {"a01": "the worker process ended 2 times (signal 9, Killed)"}
 
 
+def test_simulated_scenes_are_made_at_the_worker(tmp_path):
+    settings = SimulatorSettings(duration=1.0, warm_up=2.0)
+    source = SimulatedSource(simulator=settings, scenes=2, seed=7)
+    with source.parts() as parts:
+        inputs = list(parts.parts)
+    run(inputs, tmp_path / "parallel", workers=2)
+    run(inputs, tmp_path / "serial")
+    assert content(tmp_path / "parallel") == content(tmp_path / "serial")
+    (first, second) = content(tmp_path / "serial").values()
+    assert first != second
+
+
 def test_a_held_scene_is_known_by_all_it_holds():
     settings = SimulatorSettings(duration=1.0, warm_up=2.0)
     with opened_scene(SimulatedSource(simulator=settings, scenes=1, seed=7), "scene-0001") as at:
@@ -183,6 +206,23 @@ def test_one_process_of_a_node_compiles_kernels_while_the_others_wait(monkeypatc
     monkeypatch.setattr(pools, "load_kernels", lambda: happened.append("alone"))
     pools.perform_on_node("third")  # type: ignore[arg-type]
     assert happened[-2:] == ["alone", "third"]
+
+
+def test_kernels_are_loaded_before_workers_begin(monkeypatch):
+    """Else each of them compiles them, and says so."""
+    happened: list[str] = []
+
+    class Worker:
+        def __init__(self, scratch: Path | None) -> None:
+            happened.append("worker")
+
+        def end(self) -> None:
+            pass
+
+    monkeypatch.setattr(pools, "_Worker", Worker)
+    monkeypatch.setattr(pools, "load_kernels", lambda: happened.append("kernels"))
+    assert list(LocalPool(2).outcomes(iter(()), 2)) == []
+    assert happened == ["kernels", "worker", "worker"]
 
 
 # `saga-fg track ... --workers N`, killed in the middle and run again; and on a Ray cluster of two workers
@@ -299,6 +339,44 @@ def test_a_ray_cluster_of_two_workers_of_which_one_is_killed(tmp_path):
     assert result.returncode == 0, result.stderr
     assert len(list((tmp_path / "deaths").iterdir())) == 1
     pattern = str(tmp_path / "in" / "*.csv")
+    assert saga_fg("track", "file", pattern, "--workers", "1", "-o", tmp_path / "serial").exit_code == 0
+    assert content(tmp_path / "ray") == content(tmp_path / "serial")
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """The address of a cluster of two CPUs that `ray start` has made, and that ends with its processes."""
+    pytest.importorskip("ray", reason="Ray comes with the extra ray")
+    monkeypatch.setenv("RAY_AUTH_MODE", "token")  # handed out by the environment, as the guide says
+    monkeypatch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(32))
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    folder = Path(tempfile.mkdtemp(prefix="ray"))  # short: Ray puts sockets into it
+    ray = [sys.executable, "-c", "from ray.scripts.scripts import main; main()", "start", "--head", "--block"]
+    ray += ["--node-ip-address", "127.0.0.1", "--port", address.rpartition(":")[2], "--num-cpus", "2"]
+    ray += ["--include-dashboard", "false", "--temp-dir", str(folder)]
+    with (folder / "log").open("w") as log:
+        head = subprocess.Popen(ray, stdout=log, stderr=log, start_new_session=True)
+    try:
+        while "Ray runtime started" not in (folder / "log").read_text():
+            assert head.poll() is None, (folder / "log").read_text()
+            time.sleep(0.2)
+        yield address
+    finally:
+        os.killpg(head.pid, signal.SIGTERM)
+        head.wait()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def test_a_cluster_that_is_there_already(cluster, tmp_path):
+    write_recordings(tmp_path / "in", 3)
+    pattern = str(tmp_path / "in" / "*.csv")
+    command = [*COMMAND, "track", "file", pattern, "--ray", cluster, "--output", str(tmp_path / "ray")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    run = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    assert run.returncode == 0, run.stderr
+    assert "3 scenes: 3 done, 0 unchanged, 0 failed" in run.stdout
     assert saga_fg("track", "file", pattern, "--workers", "1", "-o", tmp_path / "serial").exit_code == 0
     assert content(tmp_path / "ray") == content(tmp_path / "serial")
 
