@@ -24,7 +24,7 @@ import numpy as np
 from saga_fg.errors import InputError, require_type
 from saga_fg.numerics import FloatArray
 from saga_fg.settings import Settings, setting, settings_group
-from saga_fg.tables.plausibility import COUNTS
+from saga_fg.tables.plausibility import FRAME_COUNTS
 from saga_fg.types import FILL_IN, Finding, Mend
 
 Kind = Literal["time", "length", "speed", "angle", "score"]
@@ -315,7 +315,7 @@ def understood(
         there = ", ".join(name[:40] for name in sorted(names)[:12]) or "none"
         there += f", ... ({len(names)} in all)" if len(names) > 12 else ""
         wanted = " and ".join(f"a column {ours!r}" for ours in missing)
-        counted = next((name for name in unread if _plain(name) in COUNTS and "timestamp" in missing), "")
+        counted = next((name for name in unread if _plain(name) in FRAME_COUNTS and "timestamp" in missing), "")
         mends |= dict.fromkeys(missing, FILL_IN) | ({"timestamp": counted} if counted else {})
         units = {"time": "10Hz"} if counted else {}  # as many frames a second, to be changed
         named = {ours: "NAME" if mends[ours] == FILL_IN else mends[ours] for ours in missing}

@@ -77,12 +77,12 @@ def settings_without_data(where: str, set_up: Collection[str], there: Collection
 FEWEST = 20  # values that allow a judgement
 _FASTEST = {"pedestrian": 12.0, "bicycle": 25.0}  # m/s
 _FASTEST_VEHICLE, _FASTEST_OTHER = 75.0, 110.0  # m/s
-COUNTS = {"frame", "frames", "step", "timestep", "tick", "index", "idx", "sweep"}
+FRAME_COUNTS = {"frame", "frames", "step", "timestep", "tick", "sweep"}  # an index may be that of the row
 
 
 def repeated_rows(frame: IntArray, boxes: Boxes, score: FloatArray) -> Finding | None:
     """Detections of frames (n,) that are given twice: of one place, size, class and score."""
-    values = np.column_stack([frame, boxes.position, boxes.size, boxes.yaw, score])
+    values = np.column_stack([frame, boxes.position, boxes.size, boxes.yaw, boxes.velocity, score])
     _, label = np.unique(boxes.label, return_inverse=True)
     again = len(values) - len(np.unique(np.column_stack([np.nan_to_num(values, nan=-1.0), label]), axis=0))
     if again < FEWEST or again < 0.05 * len(values):
@@ -193,7 +193,7 @@ def frames_taken_for_seconds(column: str, time: FloatArray) -> Finding | None:
     """Times (n,) read as s from a column whose name is that of a count, and which are whole numbers."""
     words = set(re.findall(r"[a-z]+", column.lower()))
     known = np.unique(time[np.isfinite(time)])
-    if not words & COUNTS or len(known) < 3 or (known % 1).any():
+    if not words & {*FRAME_COUNTS, "index", "idx"} or len(known) < 3 or (known % 1).any():
         return None
     what = f"times are whole numbers of the column {column[:40]!r}: they look like frames, such as 10 a second"
     return Finding("frames", what, "expected seconds", Mend(units={"time": "10Hz"}))

@@ -61,8 +61,10 @@ class OnlinePath:
         """Take in a frame, after a motion a_T_b (4, 4) since the one before, and return the tracks.
 
         a_T_b is the identity for the first frame; covariance: (6, 6) of it, as in `OdometryIncrements`. Raises
-        `InputError` for a frame that is not later than the last one, or in world coordinates without a pose.
+        `InputError` for a motion that is none, and for a frame that is not later than the last one, or in world
+        coordinates without a pose.
         """
+        a_T_b = checked_transform("a_T_b", a_T_b)
         number, solved, pose = 0, self.world_T_ego, self.world_T_ego
         if self._window:
             before, place, _ = self._window[-1]
@@ -133,5 +135,5 @@ def _landmarks(
     if not rows:
         return places, []
     keys, seen, covariances = (np.array(column) for column in zip(*rows, strict=True))
-    robust = Robust("cauchy", settings.outlier_scale)
+    robust = None if math.isinf(settings.outlier_scale) else Robust("cauchy", settings.outlier_scale)
     return places, [relative_factors(keys.astype(np.uint64), seen, covariances, 2, robust=robust)]

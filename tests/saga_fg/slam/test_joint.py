@@ -219,6 +219,15 @@ def test_slow_errors_of_the_odometry_are_found_online(caplog):
     np.testing.assert_array_less(np.abs(online.errors[:2] - [0.02, -0.004]), 3 * deviations[:2])
 
 
+def test_a_motion_that_is_none_is_refused_and_no_loss_is_a_setting():
+    frames, odometry, poses, _ = drive(n=5)
+    plain = replace(SETTINGS, outlier_scale=np.inf)
+    online, path, _ = driven_online(frames[:4], odometry, poses, plain)
+    with pytest.raises(InputError, match=r"a_T_b.*expected a finite number"):
+        online.step(frames[4], np.full((4, 4), np.nan))
+    assert np.isfinite(path).all()
+
+
 def test_objects_that_contradict_the_odometry_leave_it_as_it_is(caplog):
     """Odometry is exact, and what seems parked drifts as no odometry of such noise would make it."""
     frames, odometry, poses, _ = drive(moving=0)
