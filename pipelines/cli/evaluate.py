@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from data_tools.datasets import DatasetSource, Innovations, Results, input_files, read_tracks
+from data_tools.datasets import DatasetSource, DetectionFileSource, Innovations, Results, input_files, read_tracks
 from data_tools.evaluation import LEGEND, Evaluation
 from data_tools.figures import write_figures
 from data_tools.files import write_text, write_zip
@@ -63,7 +63,7 @@ def _evaluate(
         found, innovations = _tracked(source, settings, tracker.method)
     else:
         given = {name: value for name, value in vars(tracker).items() if value != getattr(TrackerOptions, name)}
-        others = {"config": config, "settings": getattr(source, "settings", None)}
+        others = {"config": config, "settings": source.settings if isinstance(source, DetectionFileSource) else None}
         for name, value in (given | {name: value for name, value in others.items() if value is not None}).items():
             raise InputError(f"--{name} {value}: goes without a result, which is made by it")
         with working("reading"):

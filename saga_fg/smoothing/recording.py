@@ -48,7 +48,7 @@ from saga_fg.smoothing.passes import SmoothedObjects, smooth_objects, track_evid
 from saga_fg.smoothing.settings import PRIOR_OPPORTUNITY_TIME, SmoothingSettings
 from saga_fg.smoothing.states import LabelCounts, Labels
 from saga_fg.tables import Table, TableImport, table_like
-from saga_fg.tracking import GreedyTracker, Method, TableSettings, Tracker, TrackerSettings, read_scenes, scaled_sensors
+from saga_fg.tracking import GreedyTracker, Method, SettingsName, Tracker, TrackerSettings, read_scenes, scaled_sensors
 from saga_fg.types import Frame
 
 MIN_LENGTH = 5.0  # s, of a chunk that ends early: below the margins at its ends, which are smoothed again, take over
@@ -425,7 +425,7 @@ class TableLabels:
 
 def smooth(
     detections: Table,
-    settings: TrackerSettings | TableSettings | None = None,
+    settings: TrackerSettings | SettingsName | None = None,
     sensors: Mapping[str, Sensor] | None = None,
     smoothing: SmoothingSettings | None = None,
     corrections: Iterable[Correction | Mapping[str, Any]] = (),

@@ -1,13 +1,11 @@
 from .column_names import (
     COMMAND,
-    Clock,
     Columns,
     TableImport,
     canonical,
     meaning,
     option_text,
     pairs,
-    seconds_of_dates,
     understood,
 )
 from .columns import (
@@ -31,6 +29,7 @@ from .columns import (
 from .conventions import Sample, findings_of
 from .detections import NAME, DetectionTable, Table, box_columns, raw_table, scenes_of, sorted_by_time, table_like, tell
 from .plausibility import idle_lanes, idle_rules, seems_dense_traffic, settings_without_data, usual_class, usual_classes
+from .units import Clock, seconds_of_dates
 
 __all__ = [
     "BOX",

@@ -9,33 +9,20 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from datetime import UTC, datetime
 from difflib import get_close_matches
-from functools import cache, reduce
-from math import pi
+from functools import reduce
 from operator import or_
 from types import MappingProxyType
 from typing import Any, Literal
 
-import numpy as np
-
 from saga_fg.errors import InputError, require_type
-from saga_fg.numerics import FloatArray
 from saga_fg.settings import Settings, setting, settings_group
 from saga_fg.tables.plausibility import FRAME_COUNTS
+from saga_fg.tables.units import KINDS, UNITS, checked_unit, kind_of, quantity, unit_of_speed
 from saga_fg.types import FILL_IN, Finding, Mend
 
-Kind = Literal["time", "length", "speed", "angle", "score"]
-FACTORS: Mapping[Kind, Mapping[str, float]] = {
-    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-    "length": {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048},
-    "speed": {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704, "ft/s": 0.3048},
-    "angle": {"rad": 1.0, "deg": pi / 180, "clockwise": -1.0, "clockwise_deg": -pi / 180}
-    | {"compass": -pi / 180, "compass_rad": -1.0},
-    "score": {"share": 1.0, "percent": 0.01},
-}
 _BY_SIZE = {
     "times": "timestamp",
     "angle in degrees": "yaw",
@@ -45,133 +32,6 @@ _BY_SIZE = {
 }
 """By kind of finding: a column whose unit is told by the size of its numbers alone."""
 _DEGREES = {"clockwise": "clockwise_deg", "compass_rad": "compass"}
-OFFSETS = {"compass": pi / 2, "compass_rad": pi / 2}
-"""Offset of angles in these units, rad: a compass counts clockwise from the y axis, which is north."""
-ISO = "iso8601"
-UNITS: Mapping[str, Mapping[str, str]] = {
-    "time": {"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "msec": "ms", "millis": "ms"}
-    | {"us": "us", "usec": "us", "micros": "us", "ns": "ns", "nsec": "ns", "nanos": "ns", "utc": "s"},
-    "length": {name: name for name in FACTORS["length"]} | {"meters": "m", "metres": "m", "feet": "ft"},
-    "speed": {"mps": "m/s", "ms": "m/s", "m_s": "m/s", "kmh": "km/h", "kph": "km/h", "mph": "mph", "fps": "ft/s"},
-    "angle": {"rad": "rad", "radians": "rad", "deg": "deg", "degrees": "deg", "degree": "deg"},
-    "score": {"percent": "percent", "pct": "percent"},
-}
-"""Ends of the names of columns, by kind."""
-
-_KINDS: dict[str, Kind] = {
-    "timestamp": "time",
-    **dict.fromkeys(("x", "y", "z", "length", "width", "height", "ego_x", "ego_y", "ego_z"), "length"),
-    **dict.fromkeys(("gps_x", "gps_y", "gps_z", "odometry_x", "odometry_y"), "length"),
-    **dict.fromkeys(("vx", "vy", "range_rate"), "speed"),
-    **dict.fromkeys(("yaw", "ego_yaw", "odometry_yaw"), "angle"),
-    "score": "score",
-}
-kind_of: Mapping[str, Kind] = MappingProxyType(_KINDS)
-"""The quantity that the numbers of a column measure, by our name."""
-
-_PER_SECOND = {"m": "m/s", "km": "km/h", "ft": "ft/s"}
-_LARGEST_SECONDS = 1e11  # beyond, numbers are no seconds
-_LONGEST_STEP = 10.0  # s between frames, beyond which a finer unit is likelier
-_ISO_DAY = re.compile(r"\s*\d{4}-\d\d-\d\d\s*$")
-_ISO_DATE = re.compile(r"\s*\d{4}-?\d\d-?\d\d[T ]\d\d")
-
-
-def in_our_unit(name: str, numbers: FloatArray, unit: str, power: int = 1) -> FloatArray:
-    """Numbers (n,) of a column of ours, in a unit to this power, in ours."""
-    return numbers * FACTORS[kind_of[name]][unit] ** power + OFFSETS.get(unit, 0.0)
-
-
-KINDS = ("time", "length", "speed", "angle", "score")
-
-
-def unit_of_speed(length: str) -> str:
-    """Unit of speeds where only that of lengths is given: the same per second."""
-    return _PER_SECOND.get(length, "m/s") if length != "km" else "m/s"
-
-
-@dataclass(frozen=True)
-class Clock:
-    """The clock of a column of times: its `unit` (s, ms, us, ns, iso8601, or frames at a rate such as 10Hz).
-
-    guessed  True if the unit is neither given nor part of the column's name, and not s
-    """
-
-    unit: str = "s"
-    guessed: bool = False
-
-    def seconds(self, numbers: FloatArray) -> FloatArray:
-        """Times (n,) as seconds."""
-        if self.unit == ISO:
-            return numbers
-        rate = frame_rate(self.unit)
-        if rate is not None:
-            return numbers / rate
-        return numbers if self.unit == "s" else numbers / round(1 / FACTORS["time"][self.unit])
-
-    @classmethod
-    def fitting(cls, numbers: FloatArray) -> Clock:
-        """The clock that fits times (n,), NaN where there is none: s, unless they are too large for it.
-
-        Of the finer units, that of times since 1970, or the first in which frames are not apart by 10 s and more.
-        """
-        known = np.unique(numbers[np.isfinite(numbers)])
-        largest = float(np.abs(known).max(initial=0.0))
-        if largest <= _LARGEST_SECONDS:
-            return cls()
-        with np.errstate(over="ignore"):  # damaged numbers
-            step = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
-        likely = [unit for unit, most in (("ms", 1e14), ("us", 1e17), ("ns", np.inf)) if largest < most]
-        fitting = [unit for unit in likely if step * FACTORS["time"][unit] <= _LONGEST_STEP]
-        return cls((fitting or likely)[0], guessed=True)
-
-
-def frame_rate(unit: str) -> float | None:
-    """Frames per second of a unit such as 10Hz, None for another unit."""
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*[hH][zZ]", unit)
-    return float(found[1]) if found and float(found[1]) > 0 else None
-
-
-def _kind(name: str) -> str:
-    return name if name in KINDS else kind_of.get(name, name)
-
-
-def checked_unit(kind: str, unit: str) -> str:
-    """A unit of a kind. Raises `InputError` for another."""
-    if kind == "time" and (frame_rate(unit) is not None or unit == ISO):
-        return unit
-    known = FACTORS[kind]  # type: ignore[index]
-    unit = UNITS.get(kind, {}).get(unit, unit)
-    if unit not in known:
-        rates = ", iso8601, or frames at a rate such as 10Hz" if kind == "time" else ""
-        raise InputError(f"{kind}: expected one of {', '.join(known)}{rates}, got {unit[:40]!r}")
-    return unit
-
-
-def is_date(value: Any, to: Literal["day", "minute"] = "minute") -> bool:
-    """True for a text that begins like a date with a time of ISO 8601, or is one without a time (`to` the day)."""
-    return isinstance(value, str) and (_ISO_DATE if to == "minute" else _ISO_DAY).match(value) is not None
-
-
-def seconds_of_dates(values: Sequence[Any]) -> FloatArray:
-    """Seconds (n,) since 1970 of texts in ISO 8601, UTC where none says otherwise; NaN for None.
-
-    Raises `ValueError` with the number of the row as its argument.
-    """
-    seconds = np.full(len(values), np.nan)
-    for row, value in enumerate(values):
-        if value is not None:
-            try:
-                seconds[row] = _seconds(value)
-            except (AttributeError, TypeError, ValueError) as error:  # no text, or none of a date
-                raise ValueError(row) from error
-    return seconds
-
-
-@cache
-def _seconds(text: str) -> float:
-    date = datetime.fromisoformat(text.strip())
-    return (date if date.tzinfo is not None else date.replace(tzinfo=UTC)).timestamp()
-
 
 _PLACE = (
     "pos_# position_# #_position #_pos p# t# c# center_# #_center centre_# #_centre translation_# location_# #_world "
@@ -395,7 +255,7 @@ class TableImport(Settings):
         for name in self.units:
             if name not in KINDS and name not in kind_of:
                 raise InputError(f"units.{name[:40]}: expected one of {', '.join(KINDS)}, or a column such as yaw")
-        units = {name: checked_unit(_kind(name), unit) for name, unit in self.units.items()}
+        units = {name: checked_unit(quantity(name), unit) for name, unit in self.units.items()}
         vars(self).update(columns=columns, units=units)
 
     def unit(self, name: str, by_name: str | None) -> str | None:
@@ -437,7 +297,7 @@ class TableImport(Settings):
             by_name = _unit_at_end(column, names.get(column, ""))
             return _DEGREES.get(unit, unit) if self.unit(column, by_name) == "deg" else unit
 
-        return {name: mended(name, unit) if _kind(name) == "angle" else unit for name, unit in units.items()}
+        return {name: mended(name, unit) if quantity(name) == "angle" else unit for name, unit in units.items()}
 
     def option_for(self, mend: Mend, names: Mapping[str, str], within: str = COMMAND) -> str:
         """The options that mend a suspicion, in place of those of the same name; `within` as of `option_text`."""

@@ -23,17 +23,9 @@ from saga_fg.numerics import (
     refuse,
     yaw_of,
 )
-from saga_fg.tables.column_names import (
-    COMMAND,
-    ISO,
-    Clock,
-    Columns,
-    TableImport,
-    in_our_unit,
-    is_date,
-    seconds_of_dates,
-)
+from saga_fg.tables.column_names import COMMAND, Columns, TableImport
 from saga_fg.tables.plausibility import days_taken_for_times, frames_taken_for_seconds
+from saga_fg.tables.units import ISO, Clock, in_our_unit, is_date, seconds_of_dates
 from saga_fg.types import (
     FILL_IN,
     LATEST,

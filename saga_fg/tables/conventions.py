@@ -296,7 +296,7 @@ def _fits_better(sample: Sample, rows: IntArray, read: FloatArray, other: FloatA
     motions = [sample.motion(read), sample.motion(other)]
     own = int(turn is None)  # the one of them that is of the vehicle's frame
     motions[own] = rotated(motions[own], -sample.ego[1])
-    if own == 1 and _lean_over(sample, motions, rows):
+    if own == 1 and _cross_traffic_fits(sample, motions, rows):
         return True
     for apart_of, least in ((_heading_apart, 0.12), (_velocity_apart, 0.3)):
         apart = [apart_of(sample, motion, rows) for motion in motions]
@@ -317,7 +317,7 @@ _TRAVELLED = 3.0  # m of the vehicle, from which it shows what moves with it
 _PAIRS = 20  # pairs of frames that are compared
 
 
-def _lean_over(sample: Sample, motions: Sequence[FloatArray], rows: IntArray) -> bool:
+def _cross_traffic_fits(sample: Sample, motions: Sequence[FloatArray], rows: IntArray) -> bool:
     """True if what goes across fits `motions[1]` alone: seen from the vehicle it is headed elsewhere than it moves."""
     across = rows[np.abs(np.sin(sample.yaw[rows])) > _ALONG]
     return _less_apart([_heading_apart(sample, motion, across) for motion in motions], 0.12, 0.4)

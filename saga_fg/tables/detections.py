@@ -10,7 +10,7 @@ import numpy as np
 
 from saga_fg.errors import InputError, error_context, require_type, unknown_name
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, StrArray, from_upper_triangle, refuse, yaw_transform
-from saga_fg.tables.column_names import Clock, TableImport, option_text, understood
+from saga_fg.tables.column_names import TableImport, option_text, understood
 from saga_fg.tables.columns import (
     BOX,
     COLUMNS,
@@ -27,6 +27,7 @@ from saga_fg.tables.columns import (
     clock_of,
 )
 from saga_fg.tables.conventions import Sample, findings_of
+from saga_fg.tables.units import Clock
 from saga_fg.types import Boxes, Coordinates, Detections, Finding, Frame, Mend, Scene, refuse_contradictions
 
 _COORDINATES = ("world", "ego", "sensor", "camera")

@@ -114,7 +114,7 @@ def plain_settings() -> TrackerSettings:
     return TrackerSettings(min_hits=2)
 
 
-TableSettings = Literal["plain", "dense"]
+SettingsName = Literal["plain", "dense"]
 """Settings by name: `plain_settings`, or `dense_traffic_settings`."""
 
 UNKNOWN_SENSORS: Mapping[str, Sensor] = {DEFAULT: Sensor(calibrate_noise=True, clutter_area=5000.0)}
@@ -130,7 +130,7 @@ UNNAMED = "object"
 
 def track(
     detections: Table,
-    settings: TrackerSettings | TableSettings | None = None,
+    settings: TrackerSettings | SettingsName | None = None,
     sensors: Mapping[str, Sensor] | None = None,
     how: TableImport | None = None,
     method: Method = "saga",
@@ -175,7 +175,7 @@ def predict(
     horizons: ArrayLike = HORIZONS,
     times: ArrayLike | None = None,
     modes: bool = False,
-    settings: TrackerSettings | TableSettings | None = None,
+    settings: TrackerSettings | SettingsName | None = None,
     sensors: Mapping[str, Sensor] | None = None,
     how: TableImport | None = None,
     method: Method = "saga",
@@ -220,7 +220,7 @@ def predict(
     return table_like(detections, parts or [found.named("", PredictedTracks.empty(0.0, ahead).table_columns(modes))])
 
 
-def _tell_default(settings: TrackerSettings | TableSettings | None) -> None:
+def _tell_default(settings: TrackerSettings | SettingsName | None) -> None:
     """Warn, at the caller's caller, of a default that fits no table, where others were changed."""
     usual = TrackerSettings()
     if isinstance(settings, TrackerSettings) and settings != usual and settings.min_hits == usual.min_hits:
@@ -259,7 +259,7 @@ class TableScenes(NamedTuple):
 def read_scenes(
     detections: Table,
     how: TableImport | None,
-    settings: TrackerSettings | TableSettings | None,
+    settings: TrackerSettings | SettingsName | None,
     sensors: Mapping[str, Sensor] | None,
     method: Method,
 ) -> TableScenes:
@@ -269,8 +269,8 @@ def read_scenes(
     """
     if method not in get_args(Method):
         raise InputError(f"method: expected one of {', '.join(get_args(Method))}, got {method!r}")
-    if isinstance(settings, str) and settings not in get_args(TableSettings):
-        raise InputError(f"settings: expected plain, dense or TrackerSettings, got {settings!r}")
+    if isinstance(settings, str) and settings not in get_args(SettingsName):
+        raise InputError(f"settings: expected {', '.join(get_args(SettingsName))} or TrackerSettings, got {settings!r}")
     if not isinstance(settings, str | None):
         require_type("settings", settings, TrackerSettings)
     if method == "centerpoint" and settings is not None:

@@ -160,7 +160,7 @@ _OF_DATASETS = (
     (re.compile(r"\d+(,-?[0-9.e+-]+){5,}$"), "MOTChallenge", "motchallenge"),
     (re.compile(r"\{.*\"(results|meta)\""), "nuScenes", "nuscenes"),
 )
-"""What the first line of a file of a dataset begins with, its name, and its command."""
+"""Datasets by the first line of their files: a pattern, the name, and the command that reads them."""
 
 
 def _of_a_dataset(path: Path) -> str:

@@ -18,7 +18,8 @@ from data_tools.datasets.detection_files import (
     read_truth,
 )
 from saga_fg.errors import InputError
-from saga_fg.tables.column_names import ALIASES, FACTORS, Clock, canonical, meaning, pairs
+from saga_fg.tables.column_names import ALIASES, canonical, meaning, pairs
+from saga_fg.tables.units import FACTORS, Clock
 
 T0 = 1_700_000_000
 ROWS: list[dict[str, Any]] = [
