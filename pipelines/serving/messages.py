@@ -144,7 +144,8 @@ class Request:
     """A message that is no frame; kind: its type.
 
     sensor    of a reset of the number of one sensor alone, whose next frame may have any
-    horizons  (H,) of a request for predictions, s after the newest frame; modes: whether to list the modes
+    horizons  (H,) of a request for predictions, s after the newest frame
+    modes     whether to list the modes of these
     """
 
     kind: str
@@ -200,22 +201,22 @@ def tracks_message(tracks: Tracks) -> dict[str, Any]:
 
 def predictions_message(predicted: PredictedTracks, modes: bool = False) -> dict[str, Any]:
     """Return the answer to a request for predictions, on request with `modes`: lists over the horizons, in world."""
-    names, horizons = predicted.id.tolist(), predicted.horizons.tolist()
-    yaw, kinds = _finite({"yaw": predicted.yaw}, len(names)), predicted.modes if modes else ()
+    ids, horizons = predicted.id.tolist(), predicted.horizons.tolist()
+    yaw = _finite({"yaw": predicted.yaw}, len(ids))
     rows = [
-        {"id": id_, "label": label} | own | heading
-        for id_, label, own, heading in zip(names, predicted.label.tolist(), _states(predicted), yaw, strict=True)
+        {"id": id_, "label": label} | state | heading
+        for id_, label, state, heading in zip(ids, predicted.label.tolist(), _states(predicted), yaw, strict=True)
     ]
-    for mode in kinds:
-        shares = _finite({"probability": mode.probability}, len(names))
-        for row, share, own in zip(rows, shares, _states(mode), strict=True):
-            row.setdefault("modes", []).append({"mode": mode.name} | share | own)
+    for mode in predicted.modes if modes else ():
+        shares = _finite({"probability": mode.probability}, len(ids))
+        for row, share, state in zip(rows, shares, _states(mode), strict=True):
+            row.setdefault("modes", []).append({"mode": mode.name} | share | state)
     return {"type": "predictions", "timestamp": predicted.timestamp, "horizons": horizons, "tracks": rows}
 
 
-def _states(of: PredictedTracks | PredictedMode) -> list[dict[str, Any]]:
+def _states(predicted: PredictedTracks | PredictedMode) -> list[dict[str, Any]]:
     """Places, velocities and covariances of each track, lists over the horizons."""
-    x, v, P = of.position, of.velocity, of.position_covariance
+    x, v, P = predicted.position, predicted.velocity, predicted.position_covariance
     columns = {"x": x[..., 0], "y": x[..., 1], "vx": v[..., 0], "vy": v[..., 1]}
     columns |= {"cov_xx": P[..., 0, 0], "cov_xy": P[..., 0, 1], "cov_yy": P[..., 1, 1]}
     return _finite(columns, x.shape[1])
