@@ -37,8 +37,7 @@ from pipelines.slam.lidar_slam import path_tracker
 from saga_fg.errors import InputError
 from saga_fg.graph import EGO_POSE, Additions, GraphView
 from saga_fg.numerics import Assignment, FloatArray, IntArray, assign
-from saga_fg.providers import OdometryNoise
-from saga_fg.slam.joint import JointSettings, OdometryIncrements, OnlinePath, estimate_jointly
+from saga_fg.slam.joint import JointSettings, OdometryIncrements, OdometryNoise, OnlinePath, estimate_jointly
 from saga_fg.slam.joint.graph import ObjectStates
 from saga_fg.slam.joint.record import KEYFRAME_PERIOD, in_ego
 from saga_fg.types import (

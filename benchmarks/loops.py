@@ -24,8 +24,7 @@ from pipelines.slam.driver import SlamResult
 from pipelines.slam.lidar_slam import LidarSlamSettings, lidar_slam
 from saga_fg.errors import InputError
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, inverse_transform
-from saga_fg.providers import OdometryNoise
-from saga_fg.slam.joint import OdometryIncrements
+from saga_fg.slam.joint import OdometryIncrements, OdometryNoise
 from saga_fg.slam.submaps import LoopClosure
 
 NOISE = OdometryNoise(  # like that of scan registration: headings drift, distances are right

@@ -29,9 +29,15 @@ from saga_fg import InputError, Tracker
 from saga_fg.graph import FactorProvider
 from saga_fg.model import LandmarkDetector, PlaneLandmark, PoleLandmark
 from saga_fg.numerics import FloatArray, inverse_transform
-from saga_fg.providers import OdometryNoise
 from saga_fg.settings import Positive, Settings, setting, settings_group
-from saga_fg.slam.joint import KEYFRAME_PERIOD, JointSettings, OdometryIncrements, estimate_jointly, in_ego
+from saga_fg.slam.joint import (
+    KEYFRAME_PERIOD,
+    JointSettings,
+    OdometryIncrements,
+    OdometryNoise,
+    estimate_jointly,
+    in_ego,
+)
 from saga_fg.slam.mapping import LandmarkObservations
 from saga_fg.slam.sensors import sensor_providers
 from saga_fg.slam.submaps import Loops, SubmapSettings

@@ -6,7 +6,7 @@ Each reads what a frame brings (`Frame.ego`) and works in the running graph wher
     providers: [{kind: "saga_fg.providers:Odometry"}, {kind: "saga_fg.providers:Gps", deviation: 0.5}]
 """
 
-from saga_fg.providers.odometry import Odometry, OdometryNoise, StartSettings
+from saga_fg.providers.odometry import Odometry, StartSettings
 from saga_fg.providers.surroundings import Landmarks, LaneKeeping, RelativeDetections
 from saga_fg.providers.vehicle_sensors import GRAVITY, Gps, Imu, Wheels, mounting, on_pose
 
@@ -17,7 +17,6 @@ __all__ = [
     "Landmarks",
     "LaneKeeping",
     "Odometry",
-    "OdometryNoise",
     "RelativeDetections",
     "StartSettings",
     "Wheels",

@@ -28,8 +28,7 @@ from data_tools.trajectories import Trajectory, trajectory_errors
 from pipelines.config import load_config
 from saga_fg import InputError
 from saga_fg.numerics.geometry import transform_points, yaw_of, yaw_transform
-from saga_fg.providers import OdometryNoise
-from saga_fg.slam.joint import JointSettings, OdometryIncrements
+from saga_fg.slam.joint import JointSettings, OdometryIncrements, OdometryNoise
 from saga_fg.types.boxes import Boxes
 
 

@@ -129,9 +129,14 @@ def _priors(k: int, new: RecordedObjects) -> list[GaussianFactors]:
     return factors
 
 
+def detection_loss(settings: JointSettings) -> Robust | None:
+    """The robust loss of detections, None where the settings have none."""
+    return None if np.isinf(settings.outlier_scale) else Robust("cauchy", settings.outlier_scale)
+
+
 def detections(record: Record, settings: JointSettings) -> list[ResidualFactors]:
     """Detections of objects, from the vehicle's pose."""
-    robust = None if np.isinf(settings.outlier_scale) else Robust("cauchy", settings.outlier_scale)
+    robust = detection_loss(settings)
     rows = list[tuple[Any, ...]]()
     for now in record:
         types = now.objects.types[np.searchsorted(now.objects.id, now.seen.id)]

@@ -15,15 +15,24 @@ as it is. Where few objects stand, m is small and so is what it changes.
 import logging
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from factors import ERROR_DIM, ResidualFactors, Robust, SolverSettings, relative_factors, solve
+from factors import ERROR_DIM, ResidualFactors, SolverSettings, relative_factors, solve
 from saga_fg.numerics import FloatArray, checked_transform, transform_points
-from saga_fg.providers.odometry import without_errors
-from saga_fg.slam.joint.graph import LIKELY, START_NOISE, TOLERANCE, error_key, object_key, odometry
+from saga_fg.slam.joint.graph import (
+    LIKELY,
+    START_NOISE,
+    TOLERANCE,
+    detection_loss,
+    error_key,
+    object_key,
+    odometry,
+)
+from saga_fg.slam.joint.odometry_noise import without_errors
 from saga_fg.slam.joint.record import EpochRecorder, JointSettings, RecordedEpoch, stationary_probabilities
 from saga_fg.slam.mapping import pose_key
 from saga_fg.tracking import Tracker
@@ -35,7 +44,19 @@ LAG = 20.0  # s; usual 10 to 40; longer: the errors are surer, and it takes long
 CORRELATED = 4.0  # factor on the covariance of detections of stationary objects
 LIMIT = 11.34  # chi^2, see above
 _ITERATIONS = 8  # largest number of linearisations a frame
-_KNOWN = 0.05  # least share of its prior variance that an estimated error is tested with
+_LEAST_SHARE = 0.05  # of its prior variance, with which an estimated error is tested
+
+
+@dataclass(frozen=True)
+class _Epoch:
+    """An epoch of the window: its pose (4, 4) and errors (3,) as solved last; the errors (3,) and their covariance
+    (3, 3) before it, which are its prior when it is the first."""
+
+    record: RecordedEpoch
+    pose: FloatArray
+    errors: FloatArray
+    prior: FloatArray
+    prior_covariance: FloatArray
 
 
 class OnlinePath:
@@ -53,9 +74,8 @@ class OnlinePath:
         self.settings = settings or JointSettings()
         self.world_T_ego = np.eye(4) if start is None else checked_transform("start", start)
         self.errors, self.covariance, self.aside = np.zeros(ERROR_DIM), np.diag(self.settings.odometry.slow**2), False
-        self._recorder, self._began = EpochRecorder(tracker), math.inf
-        self._window: list[tuple[RecordedEpoch, FloatArray, FloatArray]] = []  # with solved poses and errors
-        self._newest: list[tuple[FloatArray, FloatArray]] = []  # errors and their covariance before the epoch
+        self._recorder, self._start = EpochRecorder(tracker), math.inf
+        self._window: list[_Epoch] = []
 
     def step(self, frame: Frame, a_T_b: FloatArray, covariance: FloatArray | None = None) -> Tracks:
         """Take in a frame, after a motion a_T_b (4, 4) since the one before, and return the tracks.
@@ -67,28 +87,28 @@ class OnlinePath:
         a_T_b = checked_transform("a_T_b", a_T_b)
         number, solved, pose = 0, self.world_T_ego, self.world_T_ego
         if self._window:
-            before, place, _ = self._window[-1]
-            mended = without_errors(a_T_b, self.errors, frame.timestamp - before.time)
-            number, solved, pose = before.epoch + 1, place @ mended, pose @ (a_T_b if self.aside else mended)
+            last = self._window[-1]
+            mended = without_errors(a_T_b, self.errors, frame.timestamp - last.record.time)
+            number, solved, pose = last.record.epoch + 1, last.pose @ mended, pose @ (a_T_b if self.aside else mended)
         now = self._recorder.add(number, frame, pose, a_T_b, covariance)
-        self.world_T_ego, self._began = pose, min(self._began, now.time)
-        self._window.append((now, solved, self.errors))
-        self._newest.append((self.errors, self.covariance))
-        while now.time - self._window[0][0].time > LAG:
-            del self._window[0], self._newest[0]
+        self.world_T_ego, self._start = pose, min(self._start, now.time)
+        self._window.append(_Epoch(now, solved, self.errors, self.errors, self.covariance))
+        while now.time - self._window[0].record.time > LAG:
+            del self._window[0]
         self._solve()
         self._judge(now.time)
         return self._recorder.tracks
 
     def _solve(self) -> None:
-        record, path, _ = zip(*self._window, strict=True)
-        first, (mean, P) = record[0].epoch, self._newest[0]
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        graph.addPriorPose3(pose_key(first), gtsam.Pose3(path[0]), gtsam.noiseModel.Isotropic.Sigma(6, START_NOISE))
-        graph.push_back(gtsam.PriorFactorVector(error_key(first), mean, gtsam.noiseModel.Gaussian.Covariance(P)))
-        for now, pose, errors in self._window:
-            values.insert(pose_key(now.epoch), gtsam.Pose3(pose))
-            values.insert(error_key(now.epoch), errors)
+        record, path, first = [one.record for one in self._window], [one.pose for one in self._window], self._window[0]
+        graph, noise = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Gaussian.Covariance(first.prior_covariance)
+        held = gtsam.noiseModel.Isotropic.Sigma(6, START_NOISE)
+        graph.addPriorPose3(pose_key(first.record.epoch), gtsam.Pose3(first.pose), held)
+        graph.push_back(gtsam.PriorFactorVector(error_key(first.record.epoch), first.prior, noise))
+        values = gtsam.Values()
+        for one in self._window:
+            values.insert(pose_key(one.record.epoch), gtsam.Pose3(one.pose))
+            values.insert(error_key(one.record.epoch), one.errors)
         deviations = np.sqrt(np.diagonal(self.covariance))
         stationary = stationary_probabilities(record, np.stack(path), deviations, self.settings)
         places, seen = _landmarks(record, path, stationary, self.settings)
@@ -96,18 +116,24 @@ class OnlinePath:
             values.insert(key, place)
         settings = SolverSettings(max_iterations=_ITERATIONS, tolerance=TOLERANCE)
         solution = solve(graph, [*odometry(record, self.settings), *seen], values, settings)
-        poses = [solution.values.atPose3(pose_key(now.epoch)).matrix() for now in record]
-        slow = [solution.values.atVector(error_key(now.epoch)) for now in record]
-        self._window = list(zip(record, poses, slow, strict=True))
-        self.errors, self.covariance = slow[-1], solution.marginal(error_key(record[-1].epoch))
+        self._window = [
+            replace(
+                one,
+                pose=solution.values.atPose3(pose_key(one.record.epoch)).matrix(),
+                errors=solution.values.atVector(error_key(one.record.epoch)),
+            )
+            for one in self._window
+        ]
+        self.errors = self._window[-1].errors
+        self.covariance = solution.marginal(error_key(record[-1].epoch))
 
     def _judge(self, time: float) -> None:
         """Step aside, or come back."""
         noise = self.settings.odometry
-        wandered = noise.covariances(np.zeros(1), np.array([time - self._began]))[0].diagonal()[-ERROR_DIM:]
+        wandered = noise.covariances(np.zeros(1), np.array([time - self._start]))[0].diagonal()[-ERROR_DIM:]
         prior = noise.slow**2 + wandered
-        told = np.maximum(prior - self.covariance.diagonal(), _KNOWN * prior)
-        aside = bool((self.errors**2 / told).sum() > LIMIT)
+        expected = np.maximum(prior - self.covariance.diagonal(), _LEAST_SHARE * prior)
+        aside = bool((self.errors**2 / expected).sum() > LIMIT)
         if aside and not self.aside:
             errors = "scale {:.3f}, bias {:.4f} rad/s, course {:.3f} rad".format(*self.errors)
             log.warning("from %.3f s: odometry as it is, stationary objects contradict its noise: %s", time, errors)
@@ -121,19 +147,21 @@ def _landmarks(
     settings: JointSettings,
 ) -> tuple[dict[int, FloatArray], list[ResidualFactors]]:
     """Places (2,) of stationary objects by key, and their detections; one that moved in between is another one."""
-    since, places, rows = dict[int, int](), dict[int, FloatArray](), list[tuple[Any, ...]]()
+    began, places, rows = dict[int, int](), dict[int, FloatArray](), list[tuple[Any, ...]]()
     for now, pose, p in zip(record, path, stationary, strict=True):
         likely = p[np.searchsorted(now.objects.id, now.seen.id)] > LIKELY
         world = transform_points(pose, now.seen.z)[:, :2]
-        for name, stands, z, R, place in zip(now.seen.id.tolist(), likely, now.seen.z, now.seen.R, world, strict=True):
-            if not stands:
-                since.pop(name, None)
+        for id_, is_stationary, z, R, place in zip(
+            now.seen.id.tolist(), likely, now.seen.z, now.seen.R, world, strict=True
+        ):
+            if not is_stationary:
+                began.pop(id_, None)
                 continue
-            key = object_key(since.setdefault(name, now.epoch), name)
+            key = object_key(began.setdefault(id_, now.epoch), id_)
             places.setdefault(key, place)
             rows.append(((pose_key(now.epoch), key), z, CORRELATED * R))
     if not rows:
         return places, []
     keys, seen, covariances = (np.array(column) for column in zip(*rows, strict=True))
-    robust = None if math.isinf(settings.outlier_scale) else Robust("cauchy", settings.outlier_scale)
-    return places, [relative_factors(keys.astype(np.uint64), seen, covariances, 2, robust=robust)]
+    loss = detection_loss(settings)
+    return places, [relative_factors(keys.astype(np.uint64), seen, covariances, 2, robust=loss)]

@@ -27,6 +27,7 @@ maximum likelihood of all detections by expectation maximisation, with a Dirichl
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import accumulate
 from typing import Self
 
@@ -34,7 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from saga_fg.errors import InputError
-from saga_fg.model import NodeType, Sensor, Transition, discretise
+from saga_fg.model import NodeType, SceneGraph, Sensor, Transition, discretise
 from saga_fg.numerics import (
     BoolArray,
     Columns,
@@ -47,7 +48,6 @@ from saga_fg.numerics import (
     inverse_transform,
     transform_points,
 )
-from saga_fg.providers.odometry import OdometryNoise
 from saga_fg.settings import (
     Positive,
     PositiveInt,
@@ -56,8 +56,9 @@ from saga_fg.settings import (
     setting,
     settings_group,
 )
+from saga_fg.slam.joint.odometry_noise import OdometryNoise
 from saga_fg.tracking import Tracker, frame_measurements, motion_of
-from saga_fg.types import DEFAULT, Detections, Frame, class_numbers
+from saga_fg.types import DEFAULT, Detections, Frame, Tracks, class_numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +167,8 @@ class RecordedEpoch:
     a_T_b       (4, 4) odometry from the epoch before; the identity for the first one
     objects     at this epoch
     seen        detections of them
-    transition  of the objects that the epoch before has as well; None if there are none
+    graph       scene graph of the objects that the epoch before has as well; None if there are none
+    dt          s since the epoch before
     covariance  (6, 6) of a_T_b, as in `OdometryIncrements`, where the device states one
     """
 
@@ -175,14 +177,21 @@ class RecordedEpoch:
     a_T_b: FloatArray
     objects: RecordedObjects
     seen: RecordedDetections
-    transition: Transition | None
+    graph: SceneGraph | None
+    dt: float
     covariance: FloatArray | None = None
+
+    @cached_property
+    def transition(self) -> Transition | None:
+        """Of the objects of `graph`; None if there are none."""
+        return None if self.graph is None else discretise(self.graph, self.dt)
 
 
 class EpochRecorder:
-    """Record one frame after the other with a tracker; `tracks`: what it says of the newest."""
+    """Record one frame after the other with a tracker; `tracks`: those of the newest."""
 
     def __init__(self, tracker: Tracker) -> None:
+        self.tracks = Tracks.empty(0.0)
         self._tracker = tracker
         self._types: dict[str, NodeType] = {}
         self._last: RecordedEpoch | None = None
@@ -201,15 +210,14 @@ class EpochRecorder:
         before = tracker.graph
         self.tracks = tracker.step(Frame(frame.timestamp, frame.sensor, detections, world_T_ego, "ego"))
         seen = self._seen(frame, detections)
-        objects, transition = self._objects(seen), None
+        objects, graph = self._objects(seen), None
         if last is not None and tracker.graph is not None and tracker.graph is not before:
             graph = tracker.graph.only(last.objects.id)
             stay = last.objects.select(np.isin(last.objects.id, graph.nodes))
             objects = stay.append(objects.select(~np.isin(objects.id, stay.id)))
             objects = objects.select(np.argsort(objects.id))
-            if len(graph):
-                transition = discretise(graph, frame.timestamp - last.time)
-        self._last = RecordedEpoch(epoch, frame.timestamp, a_T_b, objects, seen, transition, covariance)
+        dt = 0.0 if last is None else frame.timestamp - last.time
+        self._last = RecordedEpoch(epoch, frame.timestamp, a_T_b, objects, seen, _or_none(graph), dt, covariance)
         return self._last
 
     def _seen(self, frame: Frame, detections: Detections) -> RecordedDetections:
@@ -251,12 +259,14 @@ def record_epochs(
     trimmed = []
     for now in record:
         kept = np.array([last[int(name)] >= now.epoch for name in now.objects.id], dtype=bool)
-        transition = now.transition
-        if transition is not None:
-            graph = transition.graph.only(now.objects.id[kept])
-            transition = discretise(graph, transition.dt) if len(graph) else None
-        trimmed.append(replace(now, objects=now.objects.select(kept), transition=transition))
+        graph = None if now.graph is None else _or_none(now.graph.only(now.objects.id[kept]))
+        trimmed.append(replace(now, objects=now.objects.select(kept), graph=graph))
     return trimmed
+
+
+def _or_none(graph: SceneGraph | None) -> SceneGraph | None:
+    """A graph with objects, None in place of one without."""
+    return graph if graph is not None and len(graph) else None
 
 
 def motion_covariances(record: Sequence[RecordedEpoch], settings: JointSettings) -> FloatArray:

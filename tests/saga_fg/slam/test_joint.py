@@ -8,10 +8,10 @@ import pytest
 from saga_fg import Boxes, Detections, Frame, InputError, Sensor, Tracker, TrackerSettings
 from saga_fg.model import CoordinatedTurn, NoiseModel, PoleLandmark
 from saga_fg.numerics import inverse_transform, yaw_transform
-from saga_fg.providers import OdometryNoise
 from saga_fg.slam.joint import (
     JointSettings,
     OdometryIncrements,
+    OdometryNoise,
     OnlinePath,
     estimate_jointly,
 )
