@@ -16,16 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 import typer
 
-from benchmarks.gap_runs import (
-    LIVES,
-    SITUATIONS,
-    GapBenchSettings,
-    Judgement,
-    LivedRun,
-    Prediction,
-    bench_gaps,
-    by_hindsight,
-)
+from benchmarks.gap_runs import LIVES, GapBenchSettings, Judgement, LivedRun, Prediction, bench_gaps, by_hindsight
 from benchmarks.recording_sets import TRAFFIC_SETS, RecordingOptions, chosen_sets
 from benchmarks.recordings.sources import ABOVE
 from benchmarks.runner import (
@@ -40,6 +31,7 @@ from benchmarks.runner import (
     ratio_of_sums,
     relative_change,
 )
+from benchmarks.situations import SITUATIONS
 from benchmarks.variants import contenders
 from data_tools.metrics import coverage
 from pipelines.cli.console import progress_bar

@@ -116,7 +116,8 @@ def contenders(family: str | Path, base: TrackConfig, wanted: str, own: Sequence
     known, found = variants(family), list[Contender]()
     for name in chosen("--contenders", wanted, tuple(known)):
         made = known[name].contender(base)
-        if name == CURVE or not any((one.method, one.config) == (made.method, made.config) for one in found):
+        same = [one for one in found if (one.method, one.config) == (made.method, made.config)]
+        if name == CURVE or all(one.name == CURVE for one in same):
             found.append(made)
     for text in own:
         title, _, path = text.partition("=")

@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.gap_runs import GapBenchSettings, LivedRun, bench_gaps, colours_at, judged_run, judgement
+from benchmarks.gap_runs import GapBenchSettings, LivedRun, bench_gaps, judged_run, judgement
 from benchmarks.recording_sets import chosen_sets
 from benchmarks.recordings.sources import ABOVE
+from benchmarks.situations import colours_at
 from benchmarks.variants import contenders
 from data_tools.figures import COLOURS, png
 from data_tools.files import write_bytes

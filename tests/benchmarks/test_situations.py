@@ -5,17 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from benchmarks.gap_runs import (
-    CurveRun,
-    Judgement,
-    LivedRun,
-    Prediction,
-    by_hindsight,
-    judgement,
-    route_of,
-    situations_of,
-)
+from benchmarks.gap_runs import CurveRun, Judgement, LivedRun, Prediction, by_hindsight, judgement
 from benchmarks.gaps import situation_figures
+from benchmarks.situations import route_of, situations_of
 from pipelines.learning.interactions import JudgedRun
 from saga_fg import Annotations, Boxes, Detections, Frame, Scene, Tracks
 from saga_fg.learning.labelled_scene import Gap, LabelledScene

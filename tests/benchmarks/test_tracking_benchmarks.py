@@ -8,19 +8,10 @@ import pytest
 from typer.testing import CliRunner
 
 from benchmarks import recording_sets
-from benchmarks.gap_runs import (
-    ExtrapolatedRun,
-    GapBenchSettings,
-    Links,
-    judgement,
-    links,
-    prepared,
-    real_gaps,
-    run_of,
-    situations_of,
-)
+from benchmarks.gap_runs import ExtrapolatedRun, GapBenchSettings, Links, judgement, links, prepared, real_gaps, run_of
 from benchmarks.gaps import rows_of
 from benchmarks.recording_sets import Score, chosen_sets, simulated_set
+from benchmarks.situations import situations_of
 from benchmarks.tracking import changes
 from benchmarks.variants import COMPONENTS, changed, contenders, variants
 from data_tools.metrics import LabelErrors
