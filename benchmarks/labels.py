@@ -6,6 +6,7 @@ refined     `saga-fg smooth --tracks`; shuffled: after the identities of every f
 together    both methods' tracks refined to one result
 detections  labels from the detections that all of them had, by `saga-fg smooth`; tracked: by `saga-fg track`
 headings    of these labels: the share that is turned round, of boxes that match a true object, all and handed out
+ellipses    of those handed out: the share of errors of position that they hold, with intervals over objects
 doubt       of these labels: how often what they say with a probability is so
 corrected   by an annotator who knows the truth and looks at a tenth of their tracks
 
@@ -34,15 +35,15 @@ from typing import Any
 import numpy as np
 
 from benchmarks.recording_sets import RecordingOptions, RecordingSet, chosen_sets
-from benchmarks.runner import Data, Row, Rows, Seed, each
+from benchmarks.runner import Data, Row, Rows, Seed, difference, each, paired_bootstrap, ratio_of_sums
 from data_tools.datasets.given_tracks import sensor_names, with_tracks
 from data_tools.datasets.results import SceneResult
-from data_tools.metrics import LabelErrors, SceneBoxes, error_summary, placed_detections
+from data_tools.metrics import LabelErrors, SceneBoxes, error_summary, nees, placed_detections
 from data_tools.metrics.scene_boxes import nearest_pairs
 from pipelines.config import Method, load_config
 from pipelines.smoothing import for_given_tracks, label_model, load_smooth_config, smooth_scene
 from pipelines.tracking import TrackedScene, track_scene
-from saga_fg.numerics import BoolArray, FloatArray, IntArray, wrap_angle
+from saga_fg.numerics import BoolArray, FloatArray, IntArray, chi_square_quantile, wrap_angle
 from saga_fg.smoothing import LabelBuilder, Labels, Probabilities, RecordingLabels
 from saga_fg.smoothing.corrections import checked_corrections
 from saga_fg.types import Scene, Tracks
@@ -380,6 +381,8 @@ def set_rows(recordings: RecordingSet, seed: int) -> Iterable[Row]:
         yield f"{recordings.name}: {len(found)} scenes", {"labels": variant, **figures(recordings, found)}
     for row in heading_rows(judgements):
         yield f"{recordings.name}: headings", row
+    for row in ellipse_rows(judgements):
+        yield f"{recordings.name}: errors within the ellipses", row
     for row in answers.rows():
         yield f"{recordings.name}: doubt", row
     for row in corrected.rows():
@@ -399,6 +402,38 @@ def heading_rows(scenes: Sequence[JudgedLabels]) -> Iterable[dict[str, Any]]:
         handed = mine & kept
         shares = {"all": turned[mine].mean(), "handed out": turned[handed].mean() if handed.any() else np.nan}
         yield {"class": name, "boxes": int(mine.sum()), "of them handed out": int(handed.sum()), **shares}
+
+
+HELD = (0.5, 0.9)  # what ellipses should hold
+FEWEST = 100  # boxes of a class that is shown
+
+
+def ellipse_rows(scenes: Sequence[JudgedLabels]) -> Iterator[dict[str, Any]]:
+    """A row for each class and for all, of labels handed out that match a true object: shares with 95 % intervals over
+    objects."""
+    found: list[tuple[str, FloatArray]] = []  # of each true object: its class, squared errors
+    for scene in scenes:
+        rows = np.flatnonzero(scene.kept & (scene.own >= 0))
+        error = scene.found.boxes.position[rows, :2] - scene.truth.boxes.position[scene.own[rows], :2]
+        squared, object_of = nees(error, scene.found.position_covariance[rows]), scene.truth.id[scene.own[rows]]
+        for name in np.unique(object_of).tolist():
+            mine = object_of == name
+            found.append((str(scene.found.boxes.label[rows[mine][0]]), squared[mine & np.isfinite(squared)]))
+    for label in ("all", *sorted({label for label, _ in found})):
+        chosen = [squared for each, squared in found if label in ("all", each)]
+        if (boxes := sum(map(len, chosen))) < FEWEST:
+            continue
+        shares = {
+            f"in {100 * p:g} %": paired_bootstrap(
+                [((squared <= chi_square_quantile(p, 2)).sum(), len(squared)) for squared in chosen],
+                [(0, 1)] * len(chosen),
+                ratio_of_sums,
+                difference,
+                draws=1000,
+            )
+            for p in HELD
+        }
+        yield {"class": label, "objects": len(chosen), "boxes": boxes, **shares}
 
 
 def as_run(scene: Scene, tracks: Sequence[Tracks]) -> TrackedScene:

@@ -44,7 +44,7 @@ import numpy as np
 
 from data_tools.datasets.detection_files import write_rows
 from data_tools.datasets.results import SceneResult
-from data_tools.files import check_writable, parsed_json, read_lines, read_text, write_text
+from data_tools.files import parsed_json, read_lines, read_text, write_text
 from data_tools.metrics import SceneBoxes, near_pairs
 from saga_fg.errors import InputError, unknown_name
 from saga_fg.numerics import BoolArray, IntArray, wrap_angle
@@ -55,15 +55,12 @@ COLUMNS = ("scene", "correction", "what", "timestamp", "x", "y", "who", "when", 
 
 
 def read_corrections(path: Path) -> tuple[Correction, ...]:
-    """Read a file. Raises `InputError` naming line and field of one that can't be used."""
-    found = corrections_of_lines(read_lines(path), path)
-    if not found:
-        raise InputError(f"{path}: expected corrections, a line each, there are none")
-    return found
+    """Read a file, which may have none. Raises `InputError` naming line and field of one that can't be used."""
+    return corrections_of_lines(read_lines(path), path)
 
 
 def corrections_of_lines(lines: Iterable[str], path: Path) -> tuple[Correction, ...]:
-    """The corrections of a file's lines; raises as `read_corrections` does, but not where there are none."""
+    """The corrections of a file's lines; raises as `read_corrections` does."""
     numbered = [(f"{path}: line {number}", line) for number, line in enumerate(lines, 1) if line.strip()]
     return tuple(correction_from(parsed_json(line, origin), origin) for origin, line in numbered)
 
@@ -74,12 +71,8 @@ def correction_lines(path: Path) -> list[str]:
 
 
 def write_correction_lines(path: Path, lines: Sequence[str]) -> None:
-    """Write a file whole; one without corrections goes, as readers take none."""
-    if any(line.strip() for line in lines):
-        write_text(path, "".join(f"{line}\n" for line in lines))
-    else:
-        check_writable(path)
-        path.unlink(missing_ok=True)
+    """Write a file whole."""
+    write_text(path, "".join(f"{line}\n" for line in lines))
 
 
 def check_classes(corrections: Iterable[Correction], classes: tuple[str, ...]) -> None:

@@ -272,6 +272,8 @@ def _smooth(
     settings = replace(settings, tracking=labels.over(settings.tracking))
     options.apart(output, *(labels.tracks or ()), *([labels.corrections] if labels.corrections else ()))
     corrections = read_corrections(labels.corrections) if labels.corrections else ()
+    if labels.corrections and not corrections:
+        typer.echo(f"{labels.corrections}: no corrections", err=True)
     check_classes(corrections, source.written.classes)
     given = read_given_tracks(source, labels.tracks or ())
     settings = smoothing.for_given_tracks(settings, given)

@@ -88,12 +88,16 @@ def test_a_broken_file_of_corrections_is_one_line_and_nothing_is_written(files, 
     whole = corrections.read_text()
     for content, expected in (
         (whole[:-20], "line 4: broken or truncated JSON"),
-        ("", "expected corrections, a line each"),
         (whole + '{"what": "exists"}\n', "line 5: at: expected time, x, y"),
     ):
         corrections.write_text(content)
         assert expected in refused("smooth", "file", table, "--corrections", corrections, "-o", tmp_path / "out")
         assert not (tmp_path / "out").exists()
+    corrections.write_text("\n")  # as a review leaves it whose corrections were all taken back
+    assert (
+        f"{corrections}: no corrections"
+        in done("smooth", "file", table, "--corrections", corrections, "-o", tmp_path / "out").stderr
+    )
 
 
 def test_tables_in_python():
