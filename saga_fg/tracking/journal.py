@@ -38,7 +38,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from saga_fg.graph import EGO_ERROR, MAP_NODE, OBJECT, GraphVariable, SceneFactorGraph
+from saga_fg.graph import EGO_ERROR, EGO_VELOCITY, MAP_NODE, OBJECT, GraphVariable, SceneFactorGraph
 from saga_fg.model import EdgeEffect, NodeTable, SceneGraph, edge_effects
 from saga_fg.numerics import BoolArray, FloatArray, IntArray, Matching, gate, mahalanobis
 from saga_fg.tracking.clock import Clock
@@ -263,8 +263,8 @@ def _position(variable: GraphVariable, graph: SceneFactorGraph) -> FloatArray:
     state = graph.state(variable.key)
     if isinstance(state, gtsam.Pose2 | gtsam.Pose3):
         return np.asarray(state.translation())[:2]
-    vector = isinstance(state, np.ndarray) and len(state) >= 2 and variable.kind != EGO_ERROR
-    return np.asarray(state[:2] if vector else np.empty(0))
+    placed = isinstance(state, np.ndarray) and len(state) >= 2 and variable.kind not in (EGO_VELOCITY, EGO_ERROR)
+    return np.asarray(state[:2] if placed else np.empty(0))
 
 
 def _rounded(values: ArrayLike) -> Any:

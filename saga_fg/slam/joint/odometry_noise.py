@@ -40,6 +40,10 @@ class OdometryNoise(Settings):
         """Deviations (3,) of scale, bias (rad/s) and course (rad) at the start, before any measurement."""
         return np.array([self.scale, self.bias, self.course])
 
+    def wandered(self, dt: FloatArray) -> FloatArray:
+        """Variances (3, n) of the changes of scale, bias (rad/s) and course (rad) within dt (n,) s."""
+        return np.square([self.scale_drift, self.bias_drift, self.course_drift])[:, None] * dt
+
     def covariances(self, distance: FloatArray, dt: FloatArray) -> FloatArray:
         """(n, 9, 9) of increments over `distance` (n,) m and `dt` (n,) s > 0.
 
@@ -48,8 +52,7 @@ class OdometryNoise(Settings):
         """
         tilt, turn = self.tilt_noise**2 * dt, self.turn_noise**2 * dt
         shift = self.distance_noise**2 * distance + self.time_noise**2 * dt
-        slow = (self.scale_drift**2 * dt, self.bias_drift**2 * dt, self.course_drift**2 * dt)
-        variances = np.stack([tilt, tilt, turn, shift, shift, shift, *slow], axis=1)
+        variances = np.stack([tilt, tilt, turn, shift, shift, shift, *self.wandered(dt)], axis=1)
         return np.asarray(variances[:, :, None] * np.eye(6 + ERROR_DIM))
 
     def of_increments(self, a_T_b: FloatArray, dt: FloatArray, stated: Sequence[FloatArray | None]) -> FloatArray:

@@ -2,27 +2,36 @@
 
 Over the last `LAG` seconds a graph has the poses, the slow errors of the odometry and the places of objects that are
 stationary with `LIKELY` and more (`saga_fg.slam.joint.record`), whose detections count with `CORRELATED` times their
-covariance: a detector errs alike from frame to frame. Moving objects are not in it. The first pose of the lag is held,
-its errors have the estimate that they had when they were newest. The path goes on by increments without the errors, so
-that it does not jump and tracks along it keep their velocities.
+covariance: a detector errs alike from frame to frame. Moving objects are not in it, nor are frames within
+`KEYFRAME_PERIOD` of a keyframe: they are tracked alone. The first pose of the lag is held, its errors have the estimate
+that they had when they were newest, after their random walk since the keyframe before, or none if that estimate was
+rejected. The path goes on by increments
+without the errors, so that it does not jump and tracks along it keep their velocities.
 
 The estimate steps aside where it contradicts the odometry. With errors e ~ N(0, P0) by the device's noise, estimated
 as m with the covariance P, m is N(0, P0 - P): where the sum of m_i^2 / (P0 - P)_ii exceeds `LIMIT`, 99 % of chi^2 with
 three degrees of freedom, what seems to stand does not, or the detector is wrong, and the path goes on by the odometry
-as it is. Where few objects stand, m is small and so is what it changes.
+as it is. P0 grows with the random walk since the start. It does so, too, where the graph of a frame did not converge.
+Where few objects stand, m is small and so is what it changes.
 """
 
 import logging
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import gtsam
 import numpy as np
 
 from factors import ERROR_DIM, ResidualFactors, SolverSettings, relative_factors, solve
-from saga_fg.numerics import FloatArray, checked_transform, transform_points
+from saga_fg.numerics import (
+    FloatArray,
+    carried_covariance,
+    checked_covariances,
+    checked_transform,
+    inverse_transform,
+    transform_points,
+)
 from saga_fg.slam.joint.graph import (
     LIKELY,
     START_NOISE,
@@ -33,7 +42,13 @@ from saga_fg.slam.joint.graph import (
     odometry,
 )
 from saga_fg.slam.joint.odometry_noise import without_errors
-from saga_fg.slam.joint.record import EpochRecorder, JointSettings, RecordedEpoch, stationary_probabilities
+from saga_fg.slam.joint.record import (
+    KEYFRAME_PERIOD,
+    EpochRecorder,
+    JointSettings,
+    RecordedEpoch,
+    stationary_probabilities,
+)
 from saga_fg.slam.mapping import pose_key
 from saga_fg.tracking import Tracker
 from saga_fg.types import Frame, Tracks
@@ -59,8 +74,29 @@ class _Epoch:
     prior_covariance: FloatArray
 
 
+@dataclass(frozen=True)
+class _Motion:
+    """Since a keyframe: as reported (4, 4), the covariance (6, 6) if each part has one, without the errors (4, 4)."""
+
+    reported: FloatArray
+    covariance: FloatArray | None
+    mended: FloatArray
+
+    def followed_by(self, a_T_b: FloatArray, covariance: FloatArray | None, mended: FloatArray) -> Self:
+        if self.covariance is not None and covariance is not None:
+            covariance = carried_covariance(inverse_transform(a_T_b), self.covariance) + covariance
+        else:
+            covariance = None
+        return replace(self, reported=self.reported @ a_T_b, covariance=covariance, mended=self.mended @ mended)
+
+
+_AT_REST = _Motion(np.eye(4), np.zeros((6, 6)), np.eye(4))
+
+
 class OnlinePath:
     """A tracker along the path that it mends, one frame after the other.
+
+    `JointSettings.passes` has no effect: each frame is associated once.
 
     world_T_ego  (4, 4) newest pose
     errors       (3,) estimated scale, bias of the yaw rate (rad/s) and course (rad) of the odometry
@@ -74,32 +110,56 @@ class OnlinePath:
         self.settings = settings or JointSettings()
         self.world_T_ego = np.eye(4) if start is None else checked_transform("start", start)
         self.errors, self.covariance, self.aside = np.zeros(ERROR_DIM), np.diag(self.settings.odometry.slow**2), False
-        self._recorder, self._start = EpochRecorder(tracker), math.inf
+        self._recorder, self._motion, self._start, self._newest = EpochRecorder(tracker), _AT_REST, 0.0, 0.0
         self._window: list[_Epoch] = []
 
     def step(self, frame: Frame, a_T_b: FloatArray, covariance: FloatArray | None = None) -> Tracks:
         """Take in a frame, after a motion a_T_b (4, 4) since the one before, and return the tracks.
 
         a_T_b is the identity for the first frame; covariance: (6, 6) of it, as in `OdometryIncrements`. Raises
-        `InputError` for a motion that is none, and for a frame that is not later than the last one, or in world
-        coordinates without a pose.
+        `InputError` for a motion or a covariance that is none, and for a frame that is not later than the last one, or
+        in world coordinates without a pose.
         """
         a_T_b = checked_transform("a_T_b", a_T_b)
-        number, solved, pose = 0, self.world_T_ego, self.world_T_ego
+        if covariance is not None:
+            covariance = checked_covariances("covariance", np.asarray(covariance)[None], 1, 6)[0]
+        number, pose, motion = 0, self.world_T_ego, self._motion
         if self._window:
-            last = self._window[-1]
-            mended = without_errors(a_T_b, self.errors, frame.timestamp - last.record.time)
-            number, solved, pose = last.record.epoch + 1, last.pose @ mended, pose @ (a_T_b if self.aside else mended)
-        now = self._recorder.add(number, frame, pose, a_T_b, covariance)
-        self.world_T_ego, self._start = pose, min(self._start, now.time)
-        self._window.append(_Epoch(now, solved, self.errors, self.errors, self.covariance))
-        while now.time - self._window[0].record.time > LAG:
-            del self._window[0]
-        self._solve()
-        self._judge(now.time)
+            number = self._window[-1].record.epoch + 1
+            mended = without_errors(a_T_b, self.errors, frame.timestamp - self._newest)
+            pose = pose @ (a_T_b if self.aside else mended)
+            motion = motion.followed_by(a_T_b, covariance, mended)
+        now = self._recorder.add(number, frame, pose, motion.reported, motion.covariance)
+        self.world_T_ego, self._motion, self._newest = pose, motion, now.time
+        if not self._window or now.time > self._window[-1].record.time + KEYFRAME_PERIOD:
+            self._add(now)
         return self._recorder.tracks
 
-    def _solve(self) -> None:
+    def _add(self, now: RecordedEpoch) -> None:
+        """A keyframe."""
+        solved = self.world_T_ego
+        if self._window:
+            last = self._window[-1]
+            solved = last.pose @ self._motion.mended
+            prior, covariance = self.errors, self.covariance + np.diag(self._wandered(now.time - last.record.time))
+        else:
+            self._start = now.time
+        if self.aside or not self._window:
+            prior, covariance = np.zeros(ERROR_DIM), np.diag(self._unknown(now.time))
+        self._window.append(_Epoch(now, solved, self.errors, prior, covariance))
+        self._window = [one for one in self._window if now.time - one.record.time <= LAG]
+        self._motion = _AT_REST
+        self._judge(now.time, self._solve())
+
+    def _wandered(self, dt: float) -> FloatArray:
+        return self.settings.odometry.wandered(np.array([dt]))[:, 0]
+
+    def _unknown(self, time: float) -> FloatArray:
+        """Variances (3,) of the errors at a time, s, without any measurement."""
+        return self.settings.odometry.slow**2 + self._wandered(time - self._start)
+
+    def _solve(self) -> bool:
+        """Solve the window and return whether that converged."""
         record, path, first = [one.record for one in self._window], [one.pose for one in self._window], self._window[0]
         graph, noise = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Gaussian.Covariance(first.prior_covariance)
         held = gtsam.noiseModel.Isotropic.Sigma(6, START_NOISE)
@@ -126,14 +186,13 @@ class OnlinePath:
         ]
         self.errors = self._window[-1].errors
         self.covariance = solution.marginal(error_key(record[-1].epoch))
+        return solution.converged
 
-    def _judge(self, time: float) -> None:
+    def _judge(self, time: float, converged: bool) -> None:
         """Step aside, or come back."""
-        noise = self.settings.odometry
-        wandered = noise.covariances(np.zeros(1), np.array([time - self._start]))[0].diagonal()[-ERROR_DIM:]
-        prior = noise.slow**2 + wandered
+        prior = self._unknown(time)
         expected = np.maximum(prior - self.covariance.diagonal(), _LEAST_SHARE * prior)
-        aside = bool((self.errors**2 / expected).sum() > LIMIT)
+        aside = not converged or bool((self.errors**2 / expected).sum() > LIMIT)
         if aside and not self.aside:
             errors = "scale {:.3f}, bias {:.4f} rad/s, course {:.3f} rad".format(*self.errors)
             log.warning("from %.3f s: odometry as it is, stationary objects contradict its noise: %s", time, errors)

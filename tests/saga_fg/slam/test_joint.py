@@ -201,11 +201,20 @@ SETTINGS = JointSettings(POOR)
 def driven_online(frames, reported, poses, settings):
     """The estimator after the frames, its poses, and whether it stepped aside at each."""
     online, found = OnlinePath(new_tracker(), settings, poses[0]), []
+    stated = [None] * len(frames) if reported.covariances is None else [None, *reported.covariances]
     for k, frame in enumerate(frames):
-        tracks = online.step(frame, reported.a_T_b[k - 1] if k else np.eye(4))
+        tracks = online.step(frame, reported.a_T_b[k - 1] if k else np.eye(4), stated[k])
         found.append((online.world_T_ego, online.aside))
     assert len(tracks) > 4
     return online, np.stack([pose for pose, _ in found]), np.array([aside for _, aside in found])
+
+
+def turned_by(frames, angle):
+    """Frames with detections that are turned about the vehicle, angle(t) rad."""
+    return [
+        replace(frame, detections=frame.detections.transformed(yaw_transform(yaw=angle(frame.timestamp))))
+        for frame in frames
+    ]
 
 
 def test_slow_errors_of_the_odometry_are_found_online(caplog):
@@ -219,12 +228,14 @@ def test_slow_errors_of_the_odometry_are_found_online(caplog):
     np.testing.assert_array_less(np.abs(online.errors[:2] - [0.02, -0.004]), 3 * deviations[:2])
 
 
-def test_a_motion_that_is_none_is_refused_and_no_loss_is_a_setting():
+def test_invalid_motions_are_refused_and_no_loss_is_a_setting():
     frames, odometry, poses, _ = drive(n=5)
     plain = replace(SETTINGS, outlier_scale=np.inf)
     online, path, _ = driven_online(frames[:4], odometry, poses, plain)
     with pytest.raises(InputError, match=r"a_T_b.*expected a finite number"):
         online.step(frames[4], np.full((4, 4), np.nan))
+    with pytest.raises(InputError, match=r"covariance\[0\]: expected a positive definite matrix"):
+        online.step(frames[4], np.eye(4), np.zeros((6, 6)))
     assert np.isfinite(path).all()
 
 
@@ -232,16 +243,46 @@ def test_objects_that_contradict_the_odometry_leave_it_as_it_is(caplog):
     """Odometry is exact, and what seems parked drifts as no odometry of such noise would make it."""
     frames, odometry, poses, _ = drive(moving=0)
     sure = JointSettings(OdometryNoise(scale=0.005, bias=0.001, course=0.001, course_drift=1e-5))
-    turned = [
-        replace(frame, detections=frame.detections.transformed(yaw_transform(yaw=0.01 * frame.timestamp)))
-        for frame in frames
-    ]
+    turned = turned_by(frames, lambda t: 0.01 * t)
     _, path, aside = driven_online(turned, odometry, poses, sure)
     assert aside[-1]
     assert len(caplog.messages) == (np.diff(aside.astype(int)) > 0).sum()
     assert "stationary objects contradict its noise" in caplog.text
     steps = inverse_transform(path[:-1]) @ path[1:]
     np.testing.assert_allclose(steps[aside[:-1]], odometry.a_T_b[aside[:-1]], atol=1e-9)
+
+
+def test_the_path_comes_back_from_the_odometry_when_objects_stand_again(monkeypatch):
+    monkeypatch.setattr("saga_fg.slam.joint.online.LAG", 3.0)
+    frames, odometry, poses, _ = drive(n=45, parked=10, moving=0)
+    sure = JointSettings(OdometryNoise(scale=0.005, bias=0.001, course=0.001))
+    _, _, aside = driven_online(turned_by(frames, lambda t: 0.02 * max(0.0, min(t, 6.0 - t))), odometry, poses, sure)
+    assert aside.any()
+    assert not aside[40:].any()
+
+
+def test_frames_between_keyframes_are_tracked_alone():
+    """Four times as many frames tell the same errors, and the path follows each of them."""
+    frames, odometry, poses, _ = drive(n=81, dt=0.05)
+    reported = worse(odometry, np.random.default_rng(1))
+    stated = np.tile(np.diag([1e-6, 1e-6, 1e-5, 1e-3, 1e-3, 1e-3]), (80, 1, 1))
+    every, path, _ = driven_online(frames, replace(reported, covariances=stated), poses, SETTINGS)
+    thinned = OdometryIncrements.of(reported.timestamps[::4], reported.path(poses[0])[::4])
+    thinned = replace(thinned, covariances=4 * stated[::4])
+    fewer, _, _ = driven_online(frames[::4], thinned, poses, SETTINGS)
+    np.testing.assert_allclose(every.covariance.diagonal(), fewer.covariance.diagonal(), rtol=0.05)
+    np.testing.assert_allclose(every.errors, fewer.errors, atol=0.1 * fewer.covariance.diagonal().max() ** 0.5)
+    assert off_path(path, poses).max() < off_path(reported.path(poses[0]), poses).max()
+
+
+def test_a_pause_without_objects_leaves_the_errors_to_their_random_walk():
+    frames, odometry, poses, _ = drive(n=20)
+    online, _, _ = driven_online(frames, odometry, poses, SETTINGS)
+    errors, before = online.errors, online.covariance
+    pause = 30.0
+    online.step(Frame(frames[-1].timestamp + pause, "lidar", Detections.empty(), np.eye(4), "ego"), np.eye(4))
+    np.testing.assert_allclose(online.errors, errors)
+    np.testing.assert_allclose(online.covariance, before + np.diag([0.002, 0.0005, 0.0003]) ** 2 * pause, rtol=1e-6)
 
 
 # Uncertain identity and motion of objects beside a vehicle whose path is estimated

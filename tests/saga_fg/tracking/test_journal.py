@@ -18,6 +18,7 @@ from saga_fg.model.interactions import NodeTable, SharedVelocity
 from saga_fg.model.motion import ConstantVelocity, NodeType
 from saga_fg.model.scene_graph import Edges, SceneGraph
 from saga_fg.model.sensor import NoiseModel
+from saga_fg.providers import Imu, StartSettings
 from saga_fg.tracking import AssociationSettings, ClassSettings, Journal
 from saga_fg.tracking.edge_record import ACCELERATION, MAX_RATIO, EdgeRecord, HaltingPlaces
 from saga_fg.tracking.journal import EventGraph, TrackerView
@@ -245,6 +246,14 @@ def test_any_running_graph_is_listed_factor_for_factor():
         (node,) = (node for node in record.nodes if node["name"] == str(one))
         np.testing.assert_allclose(node["position"], np.add(place, (10.0, 20.0)), atol=1e-3)
         assert ("covariance" in node) == (one.kind == OBJECT)
+
+
+def test_the_vehicle_s_velocity_is_no_place():
+    smoother, record = IncrementalSmoother([Imu(StartSettings((5.0, 6.0, 0.0), planar=False))]), EventGraph()
+    smoother.step(0.0)
+    smoother.step(0.1, frame=Frame(0.1, "imu", Detections.empty()))
+    record.add(smoother.graph())
+    assert {node["name"].split(" at")[0] for node in record.nodes} == {"vehicle 0"}
 
 
 # Edges that answer for themselves, and the lines at which vehicles halt
