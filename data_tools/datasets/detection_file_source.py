@@ -137,7 +137,7 @@ class DetectionFileSource(DatasetSource):
     @property
     def how_detections(self) -> TableImport:
         """Options for reading detections: without what a file for --import says of columns of tracks alone."""
-        return self._over(_of_detections(self.table_import))
+        return self._over((self.table_import or TableImport()).naming(COLUMNS))
 
     def _over(self, base: TableImport | None) -> TableImport:
         own = TableImport(
@@ -202,7 +202,7 @@ class DetectionFileSource(DatasetSource):
                 return table_results(rows, result, true_scenes, self.scenes is not None, self.how, judged=True)
         if self.detections is None:
             return table_results(rows, result, None, how=self.how)
-        with replace(self, columns=None, table_import=_of_detections(self.how)).open() as dataset:
+        with replace(self, columns=None, table_import=self.how.naming(COLUMNS)).open() as dataset:
             return table_results(rows, result, dataset, every_scene=truth, how=self.how, own_times=not truth)
 
     def kept(self) -> Mapping[str, Any]:
@@ -228,7 +228,7 @@ class DetectionFileSource(DatasetSource):
         dataset: Dataset = truth
         if self.detections is not None:
             with local_copy(self._table()) as path:
-                dataset = DetectedTruth(truth, read_detections(path, _of_detections(self.how)))
+                dataset = DetectedTruth(truth, read_detections(path, self.how.naming(COLUMNS)))
         yield dataset if self.scenes is None else ChosenScenes(dataset, self.scenes, f"{self.truth}: --scenes")
 
     def _table(self) -> str:
@@ -238,12 +238,6 @@ class DetectionFileSource(DatasetSource):
                 "and a folder as --output"
             )
         return (self.detections or [""])[0]
-
-
-def _of_detections(how: TableImport | None) -> TableImport:
-    """How to read detections beside tracks or true objects, which alone have the other columns that it names."""
-    how = TableImport() if how is None else how
-    return replace(how, columns={ours: theirs for ours, theirs in how.columns.items() if ours in COLUMNS})
 
 
 def score_tables(
@@ -355,7 +349,7 @@ def found_results(
     rows = _rows(tracks, TableImport(as_given=True) if names >= OWN else how)
     dataset: Dataset | None = None
     if detections is not None:
-        dataset = DetectionTable(raw_table(detections, _of_detections(how)))
+        dataset = DetectionTable(raw_table(detections, how))
     if truth is not None:
         within = "how" if truth_how is None else "truth_how"
         raw = raw_table(truth, truth_how or how, TRUTH_COLUMNS, TRACK_REQUIRED, within, lenient=True)

@@ -29,7 +29,7 @@ from pipelines.configuration import load_settings
 from pipelines.explaining import clock_lines, journal_of, read_track, story
 from saga_fg.errors import error_context
 from saga_fg.model import acting_classes
-from saga_fg.tables import idle_rules, pairs, usual_classes
+from saga_fg.tables import COLUMNS, idle_rules, pairs, usual_classes
 from saga_fg.types import FILL_IN, Finding, Mend
 
 MOST = 12  # scenes and classes that are listed
@@ -77,6 +77,8 @@ def inspect_table(
     )
     base = TableImport() if import_file is None else load_settings(TableImport, import_file)
     survey = survey_table(table, given.over(base))
+    if not survey.has_identities and base.columns.keys() - set(COLUMNS):  # detections, which have no columns of tracks
+        survey = survey_table(table, given.over(base.naming(COLUMNS)))
     _show_columns(survey)
     _show_times(survey)
     findings = (*survey.findings, *survey.how.judged(_show_classes(survey), survey.raw.found.names))

@@ -210,16 +210,19 @@ def predictions_message(predicted: PredictedTracks, modes: bool = False) -> dict
     for mode in predicted.modes if modes else ():
         shares = _finite({"probability": mode.probability}, len(ids))
         for row, share, state in zip(rows, shares, _states(mode), strict=True):
-            row.setdefault("modes", []).append({"mode": mode.name} | share | state)
+            if len(share) + len(state) == 1 + len(STATE):  # all of it is finite
+                row.setdefault("modes", []).append({"mode": mode.name} | share | state)
     return {"type": "predictions", "timestamp": predicted.timestamp, "horizons": horizons, "tracks": rows}
+
+
+STATE = ("x", "y", "vx", "vy", "cov_xx", "cov_xy", "cov_yy")
 
 
 def _states(predicted: PredictedTracks | PredictedMode) -> list[dict[str, Any]]:
     """Places, velocities and covariances of each track, lists over the horizons."""
     x, v, P = predicted.position, predicted.velocity, predicted.position_covariance
-    columns = {"x": x[..., 0], "y": x[..., 1], "vx": v[..., 0], "vy": v[..., 1]}
-    columns |= {"cov_xx": P[..., 0, 0], "cov_xy": P[..., 0, 1], "cov_yy": P[..., 1, 1]}
-    return _finite(columns, x.shape[1])
+    columns = (*np.moveaxis(x, -1, 0), *np.moveaxis(v, -1, 0), P[..., 0, 0], P[..., 0, 1], P[..., 1, 1])
+    return _finite(dict(zip(STATE, columns, strict=True)), x.shape[1])
 
 
 def _finite(columns: Mapping[str, FloatArray], n: int) -> list[dict[str, Any]]:

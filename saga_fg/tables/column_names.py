@@ -66,6 +66,7 @@ _ALIASES = {
 ALIASES = MappingProxyType({ours: tuple(aliases.split()) for ours, aliases in _ALIASES.items()})
 _SHORTEST_GUESS = 4  # letters of a name that may be a misspelt one
 _OF_TRACKS = {"id", "coasting", "settled", "cov_xx", "cov_xy", "cov_yy", "cov_vxvx", "cov_vxvy", "cov_vyvy"}
+_WITHOUT_ALIAS = {*_OF_TRACKS, "odometry_dt"}
 _OURS = {alias: ours for ours, aliases in ALIASES.items() for alias in aliases}
 
 
@@ -94,7 +95,7 @@ COMMAND = "--"
 def canonical(name: str) -> str | None:
     """Our name of a column by ours or an alias, without a unit; None for one that has no meaning."""
     plain = _plain(name)
-    return plain if plain in ALIASES or plain in kind_of else _OURS.get(plain)
+    return plain if plain in ALIASES or plain in kind_of or plain in _WITHOUT_ALIAS else _OURS.get(plain)
 
 
 def meaning(name: str) -> tuple[str, str | None] | None:
@@ -117,7 +118,7 @@ def understood(
     names: Collection[str],
     columns: Collection[str],
     required: Collection[str],
-    given: Mapping[str, str],
+    how: TableImport,
     lenient: bool = False,
     within: str = COMMAND,
 ) -> Columns:
@@ -125,13 +126,14 @@ def understood(
 
     names     of the file
     columns   of ours that have a meaning in it; required: those of them that it must have
-    given     by our name, the file's name, "" for none; lenient: they need not be there
+    how       names columns, which need not be there if `lenient`, and may have a unit of times
     within    as of `option_text`, for what mends a fault
     """
 
     def naming(columns: Mapping[str, str]) -> str:
         return option_text({"columns": columns}, within)
 
+    given = how.columns
     chosen: dict[str, str] = {}
     faults: list[str] = []
     mends: dict[str, str] = {}
@@ -177,9 +179,10 @@ def understood(
         wanted = " and ".join(f"a column {ours!r}" for ours in missing)
         counted = next((name for name in unread if _plain(name) in FRAME_COUNTS and "timestamp" in missing), "")
         mends |= dict.fromkeys(missing, FILL_IN) | ({"timestamp": counted} if counted else {})
-        units = {"time": "10Hz"} if counted else {}  # as many frames a second, to be changed
+        if counted and how.unit("timestamp", None) is None:
+            units = {"time": "10Hz"}  # as many frames a second, to be changed
         named = {ours: "NAME" if mends[ours] == FILL_IN else mends[ours] for ours in missing}
-        mend = f"; name it: {option_text({'columns': named} | ({'units': units} if counted else {}), within)}"
+        mend = f"; name it: {option_text({'columns': named} | ({'units': units} if units else {}), within)}"
         mend = mend if names else ""
         faults.insert(0, f"expected {wanted}, the columns there are {there}{mend}")
     ends = {ours: _unit_at_end(ours, name) for ours, name in chosen.items()}
@@ -245,7 +248,7 @@ class TableImport(Settings):
         for name, column in self.columns.items():
             ours = canonical(name)
             if ours is None:
-                known = (*ALIASES, *kind_of)
+                known = (*ALIASES, *kind_of, *sorted(_WITHOUT_ALIAS))
                 nearest = get_close_matches(name, known, n=1, cutoff=0.6)
                 hint = (
                     f"did you mean {nearest[0]!r}?" if nearest else f"expected one of {', '.join(dict.fromkeys(known))}"
@@ -266,6 +269,10 @@ class TableImport(Settings):
         if by_name is not None:
             return by_name
         return unit_of_speed(self.units["length"]) if kind == "speed" and "length" in self.units else None
+
+    def naming(self, columns: Collection[str]) -> TableImport:
+        """A copy that names none but these columns of ours."""
+        return replace(self, columns={ours: theirs for ours, theirs in self.columns.items() if ours in columns})
 
     def over(self, other: TableImport) -> TableImport:
         """These ways of reading, over others."""

@@ -24,8 +24,8 @@ from saga_fg.numerics import (
     yaw_of,
 )
 from saga_fg.tables.column_names import COMMAND, Columns, TableImport
-from saga_fg.tables.plausibility import days_taken_for_times, frames_taken_for_seconds
-from saga_fg.tables.units import ISO, Clock, in_our_unit, is_date, seconds_of_dates
+from saga_fg.tables.plausibility import days_taken_for_times, frames_taken_for_seconds, seconds_taken_for_frames
+from saga_fg.tables.units import ISO, Clock, frame_rate, in_our_unit, is_date, seconds_of_dates
 from saga_fg.types import (
     FILL_IN,
     LATEST,
@@ -157,8 +157,10 @@ class RawTable:
         findings: list[Finding | None] = []
         if self.clock.unit == ISO:
             findings.append(days_taken_for_times(self.numbers("timestamp")))
-        if "timestamp" in self.columns and "time" not in self.how.units and self.clock.unit == "s":
+        if "timestamp" in self.columns and self.how.unit("timestamp", None) is None and self.clock.unit == "s":
             findings.append(frames_taken_for_seconds(self.found.names.get("timestamp", ""), self.numbers("timestamp")))
+        if "timestamp" in self.columns and frame_rate(self.clock.unit) is not None:
+            findings.append(seconds_taken_for_frames(self.plain_numbers("timestamp")))
         command = self.argoverse_command()
         if command:
             what = "these are boxes of Argoverse 2, in the frame of the vehicle, and are taken for the world"

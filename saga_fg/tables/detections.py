@@ -246,8 +246,7 @@ def raw_table(
         raise InputError(f"{NAME}: expected every column once: {str(error).splitlines()[0]}") from error
     how = TableImport() if how is None else how
     require_type("how", how, TableImport)
-    given = {ours: theirs for ours, theirs in how.columns.items() if ours in columns}
-    found = understood(names, columns, required, given, lenient, within)
+    found = understood(names, columns, required, how.naming(columns), lenient, within)
     if found.faults:
         raise InputError(f"{NAME}: {'; '.join(found.faults)}")
     index, clock = nw.maybe_get_index(frame), None

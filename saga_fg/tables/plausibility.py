@@ -199,6 +199,14 @@ def frames_taken_for_seconds(column: str, time: FloatArray) -> Finding | None:
     return Finding("frames", what, "expected seconds", Mend(units={"time": "10Hz"}))
 
 
+def seconds_taken_for_frames(count: FloatArray) -> Finding | None:
+    """Times (n,) read as counts of frames, which are no whole numbers."""
+    if share(count % 1 > 0) < 0.5:
+        return None
+    what = "times are read as counts of frames and are no whole numbers: they look like seconds"
+    return Finding("frames", what, "expected counts of frames", Mend(units={"time": "s"}))
+
+
 def days_taken_for_times(time: FloatArray) -> Finding | None:
     """Times (n,), s, of dates, all of which are of midnight."""
     known = time[np.isfinite(time)]

@@ -294,6 +294,21 @@ def test_a_count_of_frames_is_proposed_as_time_with_its_rate(tmp_path):
     look = saga_fg("inspect", table).stdout
     assert f"saga-fg track file {table} --columns timestamp=frame --units time=10Hz --output tracks.csv" in look
     assert "name it: --columns timestamp=frame --units time=10Hz\n" in look
+    look = saga_fg("inspect", table, "--units", "time=20Hz").stdout
+    assert f"saga-fg track file {table} --columns timestamp=frame --units time=20Hz --output tracks.csv" in look
+    assert "name it: --columns timestamp=frame\n" in look
+
+
+def test_what_a_file_for_import_says_of_tracks_is_no_fault_of_detections(tmp_path):
+    how = tmp_path / "how.yaml"
+    how.write_text("columns: {id: object_no, score: certain}\n")
+    table = tmp_path / "d.csv"
+    table.write_text("timestamp,label,x,y,certain\n" + "".join(f"{k},car,{k},0,0.9\n" for k in range(9)))
+    look = saga_fg("inspect", table, "--import", how).stdout
+    assert "Nothing looks wrong." in look
+    assert f"saga-fg track file {table} --import {how} --output tracks.csv" in look
+    named = saga_fg("inspect", table, "--import", how, "--columns", "id=number").stdout
+    assert "--columns id=number: there is no column 'number'" in named
 
 
 def test_a_look_at_a_table_with_faults_shows_what_is_understood(tmp_path):
@@ -335,8 +350,18 @@ def test_numbers_of_frames_taken_for_seconds(tmp_path, caplog):
     caplog.clear()
     assert saga_fg(*track, "--units", "time=10Hz").exit_code == 0
     assert not caplog.records
-    assert saga_fg(*track, "--units", "time=s").exit_code == 0  # they are seconds
-    assert not caplog.records
+    for unit in ("time=s", "timestamp=s"):  # they are seconds
+        assert saga_fg(*track, "--units", unit).exit_code == 0
+        assert not caplog.records
+
+
+def test_seconds_taken_for_numbers_of_frames(tmp_path):
+    found = [{"time": k / 20, "x": k / 2 + 20 * (k % 2), "y": 2, "label": "car"} for k in range(40)]
+    track = ["track", "file", write(tmp_path / "d.csv", found), "--units", "time=20Hz", "-o", tmp_path / "t.csv"]
+    refused = saga_fg(*track)
+    assert refused.exit_code == 2
+    assert "no whole numbers: they look like seconds; add --units time=s" in refused.output
+    assert saga_fg(*track, "--as-given").exit_code == 0
 
 
 def test_boxes_of_argoverse_are_not_taken_for_the_world(tmp_path, caplog):

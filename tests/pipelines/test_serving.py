@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from pipelines.checks import Checks
 from pipelines.config import load_config
 from pipelines.serving import StreamSettings, StreamTracker, parse_address, serve_pipe
-from pipelines.serving.messages import FrameMessage, encode, parse_message
+from pipelines.serving.messages import FrameMessage, encode, parse_message, predictions_message
 from pipelines.serving.stream import Reordering
 from saga_fg import Frame, InputError, Tracks
 from saga_fg.model.edge_rules import Following
@@ -300,6 +300,10 @@ def test_modes_come_where_they_are_asked_for():
     for mode, one in zip(modes, expected, strict=True):
         np.testing.assert_allclose([mode["x"], mode["y"]], one.position[:, 0].T)
         np.testing.assert_allclose(mode["cov_xx"], one.position_covariance[:, 0, 0, 0])
+    unknown = replace(expected[0], position=np.full_like(expected[0].position, np.nan))
+    whole = tracker.predict([0.5, 2], hypotheses=True)
+    (row,) = predictions_message(replace(whole, modes=(unknown, *expected[1:])), modes=True)["tracks"]
+    assert [mode["mode"] for mode in row["modes"]] == [mode.name for mode in expected[1:]]
     (wrong,) = answers(service, predict([1], modes="all"))
     assert "modes: expected true or false, got 'all'" in wrong["message"]
 

@@ -80,8 +80,8 @@ class _Reading:
 
     def understood(self, names: Collection[str]) -> Columns:
         """The columns of the file by their meaning. Raises `InputError` for all that is wrong with their names."""
-        wanted, layout = self.hint(names).columns, self.layout
-        found = understood(names, layout.columns, layout.required, wanted, layout.lenient, layout.within)
+        layout = self.layout
+        found = understood(names, layout.columns, layout.required, self.hint(names), layout.lenient, layout.within)
         if found.faults and not (layout.faulty and names):
             raise InputError(f"{self.path}: {'; '.join(found.faults)}")
         return found

@@ -90,6 +90,10 @@ def test_columns_that_are_named_win_and_may_be_left_out(tmp_path):
     how = TableImport(columns={"x": "weird", "length": "width", "width": "length", "score": ""})
     (found,) = read_detections(path, how).scene("drive").frames[0].detections
     assert (found.position[0], found.size[:2]) == (7.0, (4.0, 3.0))
+    path = table(tmp_path, [{"time": 1, "x": 1, "y": 2, "var_x": 7, "both": 1, "var_y": 5}])
+    how = TableImport(columns={"cov_xx": "var_x", "cov_xy": "both", "cov_yy": "var_y"})
+    with_covariance = read_detections(path, how).scene("drive").frames[0].detections
+    assert with_covariance.position_covariance.tolist() == [[[7, 1], [1, 5]]]
 
 
 def test_all_columns_that_are_wrong_are_named_at_once(tmp_path):
