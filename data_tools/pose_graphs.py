@@ -143,24 +143,28 @@ def transforms(table: TextTable, record: Record) -> FloatArray:
     return rigid_transforms(quaternion_rotation(quaternion / norm[:, None]), values[:, :3])
 
 
-def information(table: TextTable, record: Record) -> FloatArray:
-    """Information matrices (n, k, k) of a record, ordered as in the file; nearly definite ones are projected."""
+def information(table: TextTable, record: Record, project: bool = False) -> FloatArray:
+    """Information matrices (n, k, k) of a record, those of poses in the order of our tangent.
+
+    Nearly definite ones are projected; project: others too.
+    """
     k, start = record.order, len(record.ids) + len(record.values)
     upper = np.triu_indices(k)
     names = tuple(f"I{i + 1}{j + 1}" for i, j in zip(*upper, strict=True))
     entries = table.numbers(slice(start, start + len(names)), names)
     matrix = np.zeros((len(entries), k, k))
     matrix[:, upper[0], upper[1]] = matrix[:, upper[1], upper[0]] = entries
-    return _definite(table, matrix)
+    matrix = _definite(table, matrix, project)
+    return matrix[:, _SPATIAL[:, None], _SPATIAL] if k == len(_SPATIAL) else matrix
 
 
-def _definite(edges: TextTable, matrix: FloatArray) -> FloatArray:
-    """Project matrices (M, k, k) that are nearly positive definite."""
+def _definite(edges: TextTable, matrix: FloatArray, project: bool) -> FloatArray:
+    """Project matrices (M, k, k) that are nearly positive definite, or all that have a positive eigenvalue."""
     values, vectors = np.linalg.eigh(matrix)
     smallest, largest, k = values[:, 0], values[:, -1], matrix.shape[1]
     expected = f"I11 ... I{k}{k}: expected a positive definite matrix, smallest eigenvalue"
-    good = (smallest >= -_SLIGHT * largest) & (largest > 0)
-    edges.check(good, lambda row: f"{expected} {smallest[row]:.3g}")
+    good = (project | (smallest >= -_SLIGHT * largest)) & (largest > 0)
+    edges.check(good, lambda row: f"{expected} {smallest[row]:.3g}; --project (Python: project) makes it one")
     near = np.flatnonzero(smallest <= 0)
     if len(near):
         example = edges.fault(int(near[0]), f"smallest eigenvalue {smallest[near[0]]:.3g}")
@@ -171,22 +175,24 @@ def _definite(edges: TextTable, matrix: FloatArray) -> FloatArray:
 
 
 Tables = Mapping[str, TextTable]
+Weights = Mapping[str, FloatArray]
 _POSE = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
 _EDGE = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
 _PRIOR = {2: "EDGE_PRIOR_SE2", 3: "EDGE_SE3_PRIOR"}
 _PLACE = {2: "EDGE_PRIOR_SE2_XY", 3: "EDGE_SE3_XYZ_PRIOR"}
 _LANDMARK = {2: "VERTEX_XY", 3: "VERTEX_TRACKXYZ"}
 _OBSERVED = {2: "EDGE_SE2_XY", 3: "EDGE_SE3_TRACKXYZ"}
-_TANGENT = {2: [0, 1, 2], 3: [3, 4, 5, 0, 1, 2]}  # where each entry of our tangent is found in the file's
+_SPATIAL = np.array([3, 4, 5, 0, 1, 2])  # where each entry of our tangent in space is found in the file's
 _OFFSET, _LARGEST_ID = "PARAMS_SE3OFFSET", 2**63 - 1
 log = logging.getLogger(__name__)
 
 
-def read_g2o(path: str | Path) -> PoseGraph:
+def read_g2o(path: str | Path, project: bool = False) -> PoseGraph:
     """Read a pose graph; poses and landmarks come in the order of their ids.
 
     A file of measurements alone starts at dead reckoning along them. An information matrix with an eigenvalue that is
-    0 or slightly negative, as rounded ones have, is projected to a positive definite one, with a warning.
+    0 or slightly negative, as rounded ones have, is projected to a positive definite one, with a warning of how many;
+    project: also where it is clearly negative, as sums of outer products with wrong signs have.
     Raises `InputError` naming the line for an unknown record, a wrong number of columns, a number that is none or too
     large, a quaternion off the unit sphere, a pose given twice or missing, or an information matrix with an eigenvalue
     that is clearly negative.
@@ -200,19 +206,22 @@ def read_g2o(path: str | Path) -> PoseGraph:
     if _EDGE[d] not in tables:
         raise InputError(f"{file}: expected {_EDGE[d]} records, there are none")
     edges = tables[_EDGE[d]]
-    between, weights = transforms(edges, RECORDS[_EDGE[d]]), _information(edges, _EDGE[d])
+    weights = {
+        tag: information(table, each, project) for tag, table in tables.items() if (each := RECORDS[tag]).weighed
+    }
+    between = transforms(edges, RECORDS[_EDGE[d]])
     whole = _POSE[d] in tables
     ids, order = _unique_ids(tables[_POSE[d]]) if whole else (_all_ends(edges), np.arange(0))
     first, second = (_rows(edges, column, name, ids) for column, name in enumerate(("first", "second")))
     edges.check(first != second, lambda row: "second: expected another pose than the first")
-    priors, places = _priors(tables, d, ids), _places(tables, d, ids)
+    priors, places = _priors(tables, weights, d, ids), _places(tables, weights, d, ids)
     _warn_of_fixed(file, fixed, ids, priors is not None or places is not None)
     if whole:
         poses = transforms(tables[_POSE[d]], RECORDS[_POSE[d]])[order]
-        graph = PoseGraph(ids, poses, first, second, between, weights, priors=priors, places=places)
+        graph = PoseGraph(ids, poses, first, second, between, weights[_EDGE[d]], priors=priors, places=places)
     else:
-        graph = PoseGraph.of_measurements(ids, first, second, between, weights, priors, places)
-    marks = _landmarks(tables, graph, whole)
+        graph = PoseGraph.of_measurements(ids, first, second, between, weights[_EDGE[d]], priors, places)
+    marks = _landmarks(tables, weights, graph, whole)
     _warn_of_unseen(file, tables, d, marks)
     return graph.with_landmarks(marks)
 
@@ -239,12 +248,12 @@ def _warn_of_fixed(file: Path, fixed: Sequence[int], ids: IntArray, anchored: bo
         log.warning("%s: FIX %d has no effect, as %s (%d poses so)", file, others[0], holds, len(others))
 
 
-def _priors(tables: Tables, d: int, ids: IntArray) -> PosePriors | None:
+def _priors(tables: Tables, information: Weights, d: int, ids: IntArray) -> PosePriors | None:
     if (tag := _PRIOR[d]) not in tables:
         return None
     table = tables[tag]
     rows = _rows(table, 0, "pose", ids)
-    poses, weights = transforms(table, RECORDS[tag]), _information(table, tag)
+    poses, weights = transforms(table, RECORDS[tag]), information[tag]
     if d == 3:  # measured is pose T offset, with errors in the sensor's frame
         sensor_T_pose = np.linalg.inv(_offsets(tables, table, 1))
         Ad = adjoint(np.asarray(sensor_T_pose, dtype=np.float64))
@@ -252,15 +261,15 @@ def _priors(tables: Tables, d: int, ids: IntArray) -> PosePriors | None:
     return PosePriors(rows, poses, weights)
 
 
-def _places(tables: Tables, d: int, ids: IntArray) -> PositionPriors | None:
+def _places(tables: Tables, information: Weights, d: int, ids: IntArray) -> PositionPriors | None:
     if (tag := _PLACE[d]) not in tables:
         return None
     table, record = tables[tag], RECORDS[tag]
     rows = _rows(table, 0, "pose", ids)
-    return PositionPriors(rows, record_values(table, record), information(table, record))
+    return PositionPriors(rows, record_values(table, record), information[tag])
 
 
-def _landmarks(tables: Tables, graph: PoseGraph, guessed: bool) -> PointLandmarks | None:
+def _landmarks(tables: Tables, information: Weights, graph: PoseGraph, guessed: bool) -> PointLandmarks | None:
     """The landmarks; their places are those of the file if all of them and the poses are in it."""
     d, tag = graph.dim, _OBSERVED[graph.dim]
     if tag not in tables:
@@ -275,7 +284,7 @@ def _landmarks(tables: Tables, graph: PoseGraph, guessed: bool) -> PointLandmark
             position = record_values(tables[vertex], RECORDS[vertex])[order][np.searchsorted(given, ids)]
     table.check(~np.isin(named, graph.ids), lambda row: f"landmark: {named[row]} is a pose")
     pose = _rows(table, 0, "pose", graph.ids)
-    z, weights = record_values(table, RECORDS[tag]), information(table, RECORDS[tag])
+    z, weights = record_values(table, RECORDS[tag]), information[tag]
     if d == 3:
         T = _offsets(tables, table, 2)
         R = T[:, :3, :3]
@@ -301,9 +310,9 @@ def write_g2o(path: str | Path, graph: PoseGraph) -> None:
     if d == 3 and (marks is not None or graph.anchored):
         lines.append(f"{_OFFSET} 0 0 0 0 0 0 0 1")
     ends = np.stack([names[graph.first], names[graph.second]], axis=1)
-    lines += _lines(_EDGE[d], ends, pose_columns(graph.first_T_second), _in_file_order(graph.information, d))
+    lines += _lines(_EDGE[d], ends, pose_columns(graph.first_T_second), _in_file_order(graph.information))
     if (priors := graph.priors) is not None:
-        poses, weights = pose_columns(priors.world_T_pose), _in_file_order(priors.information, d)
+        poses, weights = pose_columns(priors.world_T_pose), _in_file_order(priors.information)
         lines += _lines(_PRIOR[d], _without_offset(d, names[priors.pose]), poses, weights)
     if (places := graph.places) is not None:
         lines += _lines(_PLACE[d], _without_offset(d, names[places.pose]), places.position, places.information)
@@ -327,17 +336,9 @@ def _without_offset(d: int, *ids: IntArray) -> IntArray:
     return np.column_stack([*ids, np.zeros_like(ids[0])])[:, : len(ids) + d - 2]
 
 
-def _information(table: TextTable, tag: str) -> FloatArray:
-    """Information of poses, in the order of our tangent."""
-    record = RECORDS[tag]
-    tangent = np.array(_TANGENT[record.dim])
-    return information(table, record)[:, tangent[:, None], tangent]
-
-
-def _in_file_order(matrices: FloatArray, d: int) -> FloatArray:
+def _in_file_order(matrices: FloatArray) -> FloatArray:
     """Information matrices of poses in the order of the file."""
-    back = np.argsort(_TANGENT[d])
-    return np.asarray(matrices[:, back[:, None], back])
+    return matrices[:, _SPATIAL[:, None], _SPATIAL] if matrices.shape[1] == len(_SPATIAL) else matrices
 
 
 def _unique_ids(table: TextTable) -> tuple[IntArray, IntArray]:

@@ -119,8 +119,8 @@ def relative_times(values: NDArray[Any], stamp: float | None = None) -> FloatArr
     """Times (N,) of points, s relative to the scan's stamp, from values in s, ms, us or ns; None where all are one.
 
     The unit is told by the span, as no scan takes longer than 1.5 s; whole numbers are no seconds. Times of a clock are
-    relative to `stamp` if that is of the same one, to the first point else. Raises `InputError` for a longer span, and
-    for times that are not finite.
+    relative to `stamp` if that is of the same one (the first is nearer to it than to 0), to the first point else.
+    Raises `InputError` for a longer span, and for times that are not finite.
     """
     if not len(values):
         return None
@@ -134,7 +134,7 @@ def relative_times(values: NDArray[Any], stamp: float | None = None) -> FloatArr
     if not units:
         raise InputError(f"time: expected the times of one scan, in s, ms, us or ns, they span {span:g}")
     begin, since = float(first) * units[0], (values - first).astype(np.float64) * units[0]
-    if stamp is not None and abs(begin - stamp) < _TURN:
+    if stamp is not None and abs(begin - stamp) < min(_TURN, abs(begin)):
         return np.asarray(since + (begin - stamp))
     return np.asarray(since + begin if abs(begin) < _TURN else since)
 

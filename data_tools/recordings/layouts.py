@@ -102,13 +102,17 @@ def _folder(source: Path, options: RecordingOptions) -> ScanRecording:
         if by_name:
             order = np.argsort(times, kind="stable").tolist()
             files, times, lines = [files[k] for k in order], times[order], [lines[k] for k in order]
-        return _of_files("folder", files, times, _read_alike(files), clock=lambda row: f"{table}: line {lines[row]}")
-    return _of_files("folder", files, _times_of_names(files, options.period), _read_alike(files))
+        return _of_files(
+            "folder", files, times, _read_alike(files, times), clock=lambda row: f"{table}: line {lines[row]}"
+        )
+    times = _times_of_names(files, options.period)
+    return _of_files("folder", files, times, _read_alike(files, times))
 
 
-def _read_alike(files: Sequence[Path]) -> Callable[[Path], Scan]:
-    """A reader of files that must have the columns of the first one with points."""
+def _read_alike(files: Sequence[Path], times: FloatArray) -> Callable[[Path], Scan]:
+    """A reader of files at some times (K,), s, that must have the columns of the first one with points."""
     first: dict[str, tuple[str, ...]] = {}
+    stamps = dict(zip(files, times.tolist(), strict=True))
 
     def read(path: Path) -> Scan:
         columns = read_columns(path)
@@ -119,7 +123,7 @@ def _read_alike(files: Sequence[Path]) -> Callable[[Path], Scan]:
                     f"expected the columns {', '.join(names)} of the scans before, got {', '.join(columns)}: "
                     "a scan of another sensor?"
                 )
-        return scan_of_columns(columns)
+        return scan_of_columns(columns, stamps[path])
 
     for path in files:
         if path.stat().st_size:

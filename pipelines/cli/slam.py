@@ -382,6 +382,10 @@ def g2o(
             "the rest (consensus), or a loss over all of them.",
         ),
     ] = None,
+    project: Annotated[
+        bool,
+        typer.Option("--project", help="Make information matrices positive definite that are not, and say how many."),
+    ] = False,
     verbose: Verbose = False,
 ) -> None:
     """Optimise a pose graph, whatever the guess in the file is worth.
@@ -400,7 +404,7 @@ def g2o(
     check_writable_folder(output)
     rejected: list[str] = []
     loss = None if robust is None or robust == "consensus" else Robust(robust, _LOSS_SCALE)
-    graph = read_g2o(file)
+    graph = read_g2o(file, project)
     rows = _rows(covariances, graph.ids)
     with working("optimising"), error_context(str(file)):  # a graph that is whole may have no optimum, as one in pieces
         guess = graph_error(graph, loss)

@@ -115,6 +115,28 @@ def test_slightly_indefinite_information_is_projected_with_a_warning(tmp_path, c
     assert "1 information matrices" in caplog.text
 
 
+def test_clearly_indefinite_information_is_projected_on_request(tmp_path, caplog):
+    path = written(
+        tmp_path,
+        PLANAR.replace("4 1 0.5 5 0.25 6", "4 9 0 5 0 6")
+        + "EDGE_PRIOR_SE2_XY 3 1 2 1 2 1\nEDGE_PRIOR_SE2_XY 7 2 3 1 0 1\n",
+    )
+    with pytest.raises(InputError, match=r"line 6: I11 .* smallest eigenvalue -4\.51; --project \(Python: project\)"):
+        read_g2o(path)
+    graph = read_g2o(path, project=True)
+    for matrix, given in (
+        (graph.information[0][:2, :2], [[4, 9], [9, 5]]),
+        (graph.places.information[0], [[1, 2], [2, 1]]),
+    ):
+        values, vectors = np.linalg.eigh(given)
+        np.testing.assert_allclose(matrix, np.outer(vectors[:, 1], vectors[:, 1]) * values[1], atol=1e-6)
+        assert np.linalg.eigvalsh(matrix)[0] > 0
+    assert caplog.text.count("so of 1 information matrices, which are made positive definite") == 2
+    assert "3 measurements" in done("slam", "g2o", path, "--project", "--output", tmp_path / "out").output
+    with pytest.raises(InputError, match="line 6: I11"):  # nothing of it is left
+        read_g2o(written(tmp_path, PLANAR.replace("4 1 0.5 5 0.25 6", "-4 0 0 -5 0 -6")), project=True)
+
+
 def test_missing_files_and_known_places_of_no_pose_are_named(tmp_path):
     with pytest.raises(InputError, match=r"none\.g2o: cannot be read"):
         read_g2o(tmp_path / "none.g2o")

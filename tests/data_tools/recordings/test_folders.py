@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from importlib.util import find_spec
 from pathlib import Path
@@ -47,6 +48,16 @@ def test_every_format_is_read_with_the_times_of_its_names(tmp_path: Path, scans:
         else:
             assert found[k].time is None
     assert open_recording(tmp_path / "scans", RecordingOptions(timed=False, most=2))[1].time is None
+
+
+def test_times_of_points_by_the_clock_of_the_names_are_relative_to_these(tmp_path: Path, scans: list[Scan]) -> None:
+    """Those of a scan that begins before its stamp; offsets stay offsets where stamps begin at 0."""
+    for name, begin in (("of a clock", BEGIN), ("offsets", 0.0)):
+        stamps = begin + 0.1 * np.arange(1, 5)
+        taken = [replace(scan, time=scan.time + bool(begin) * stamps[k]) for k, scan in enumerate(scans)]
+        found = open_recording(write_scans(tmp_path / name, "npz", taken, stamps))
+        for k, scan in enumerate(scans):
+            np.testing.assert_allclose(found[k].time, scan.time, atol=1e-6)
 
 
 @pytest.mark.parametrize(
