@@ -138,6 +138,7 @@ class SmoothedScene:
     counts   where its boxes come from
     frames   frames taken in
     seconds  time spent
+    noise    that was found of sensors, in units of what their models say
     outcomes what became of the corrections that may be about it
     """
 
@@ -147,6 +148,7 @@ class SmoothedScene:
     counts: LabelCounts
     frames: int
     seconds: float
+    noise: Mapping[str, float]
     outcomes: Outcomes = ()
 
     @property
@@ -261,7 +263,9 @@ def _labelled(name: str, parts: Iterable[Scene], builder: LabelBuilder, progress
         labels, counts = builder.finish(advance)
     seconds += time.perf_counter() - begin
     outcomes = tuple((name, one, why) for one, why in builder.outcomes)
-    return SmoothedScene(name, _Spooled(name, labels), labels.review(), counts, frames, seconds, outcomes)
+    return SmoothedScene(
+        name, _Spooled(name, labels), labels.review(), counts, frames, seconds, builder.noise, outcomes
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,7 +75,7 @@ def read_text(path: str | Path) -> str:
     """Read a whole text file in UTF-8. Raises `InputError` as `open_bytes` does, and for what is no such text."""
     content = read_bytes(path)
     try:
-        return content.decode("utf-8")
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         packed = next((name for start, name in _COMPRESSED.items() if content.startswith(start)), None)
         got = (

@@ -92,7 +92,7 @@ class Summary:
     milliseconds: dict[str, tuple[float, ...]] = field(default_factory=dict)
     classes: set[str] = field(default_factory=set)
     clocks: dict[str, Mapping[str, SensorTime]] = field(default_factory=dict)  # of the sensors, by scene
-    noise: dict[str, list[float]] = field(default_factory=dict)  # of the sensors, in each scene
+    noise: list[Mapping[str, float]] = field(default_factory=list)  # of the sensors, in each scene
 
     def counting(self, runs: Iterable[TrackedScene]) -> Iterator[TrackedScene]:
         """Pass runs on and count them."""
@@ -102,8 +102,7 @@ class Summary:
             self.milliseconds[run.scene.name] = run.milliseconds
             if run.clocks:
                 self.clocks[run.scene.name] = run.clocks
-            for name, scale in run.noise.items():
-                self.noise.setdefault(name, []).append(scale)
+            self.noise.append(run.noise)
             self.boxes += sum(len(tracks) for tracks in run.tracks)
             self.detections += sum(len(frame.detections) for frame in run.scene.frames)
             for tracks in run.tracks:
@@ -131,11 +130,17 @@ class Summary:
         typer.echo(f"{self.output}: {', '.join(counts)}{rate}")
         if self.detections and not self.boxes:
             typer.echo(NO_TRACKS.format(self.detections, "--settings dense, for own tables,"), err=True)
-        for name, scales in self.noise.items():
-            typer.echo(
-                f"noise of {name}: {np.median(scales):.2g} of what its model says, by its successive detections; "
-                "ellipses are scaled, by class and range (sensors.*.calibrate_noise: false leaves them)"
-            )
+        _show_noise(self.noise)
+
+
+def _show_noise(found: Sequence[Mapping[str, float]]) -> None:
+    """A line for each sensor whose noise was found."""
+    for name in dict.fromkeys(name for scene in found for name in scene):
+        scale = np.median([scene[name] for scene in found if name in scene])
+        typer.echo(
+            f"noise of {name}: {scale:.2g} of what its model says, by its successive detections; ellipses are scaled, "
+            "by class and range (sensors.*.calibrate_noise: false leaves them); saga-fg learn noise finds all of it"
+        )
 
 
 def exit_on_failures(report: RunSummary) -> None:
@@ -349,3 +354,4 @@ def _show(output: Path, runs: Sequence[smoothing.SmoothedScene]) -> None:
     worth = sum(len(run.review) for run in runs)
     listed = f"{output / 'review.csv'}: {counted(worth, 'object')} worth a look, the most worth first"
     typer.echo(f"{listed}: saga-fg review {quote(str(output))}")
+    _show_noise([run.noise for run in runs])

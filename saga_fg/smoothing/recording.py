@@ -248,6 +248,11 @@ class LabelBuilder:
         return self._finished()
 
     @property
+    def noise(self) -> dict[str, float]:
+        """What was found of the sensors' noise, in units of what their models say, by name."""
+        return {name: one.scale for name, one in self._tracker.sensor_noise.items()}
+
+    @property
     def outcomes(self) -> tuple[tuple[Correction, str], ...]:
         """The corrections, and why they do not hold; "" where they do."""
         given, end = enumerate(self._model.corrections), self._sums.last

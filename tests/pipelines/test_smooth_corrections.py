@@ -50,6 +50,8 @@ def test_the_command_applies_corrections_and_names_those_that_do_not_fit(files, 
     assert f"{corrections}: line 3: class, object at 3 s, x 500.0, y 0.0: no object within 2 m" in unfit[0]
     assert "line 4" in unfit[1]
     assert "no scene c among the recordings" in unfit[1]
+    assert "by its successive detections" in run.stdout
+    assert "saga-fg learn noise" in run.stdout
     labels = read_tracks(tmp_path / "out" / "labels.csv", labels=True)
     assert (labels.scene == "a").sum() < (labels.scene == "b").sum()  # the parked car is gone from a
     assert set(labels.source[labels.scene == "b"].tolist()) >= {"corrected", "near", "observed"}
@@ -93,7 +95,7 @@ def test_a_broken_file_of_corrections_is_one_line_and_nothing_is_written(files, 
         corrections.write_text(content)
         assert expected in refused("smooth", "file", table, "--corrections", corrections, "-o", tmp_path / "out")
         assert not (tmp_path / "out").exists()
-    corrections.write_text("\n")  # as a review leaves it whose corrections were all taken back
+    corrections.write_text("\ufeff\n")  # as a review leaves it whose corrections were all taken back
     assert (
         f"{corrections}: no corrections"
         in done("smooth", "file", table, "--corrections", corrections, "-o", tmp_path / "out").stderr
