@@ -226,6 +226,9 @@ class _Bag:
         if self.main is not None and not self.main.stamps:
             what = f"{self.main.topic.count} messages, as its summary tells"
             raise InputError(f"{self.path}: {self.main.topic.name}: expected {what}, there are none")
+        if self.main is not None and len(names := dict.fromkeys(self.main.frames)) > 1:
+            what = f"expected scans of one sensor, in one frame, got {', '.join(names):.80}"
+            raise InputError(f"{self.path}: {self.main.topic.name}: {what}")
         return self._one_clock([each for each in by_topic.values() if each.stamps], records)
 
     def _one_clock(

@@ -165,6 +165,11 @@ def test_what_is_wrong_in_a_recording_is_one_line(
         with pytest.raises(InputError, match=r"j\.mcap: /points: expected 6 messages, as its summary tells, there are"):
             open_recording(path)
         monkeypatch.undo()
+    with subtests.test("two sensors on one topic"):
+        front, rear = scan_messages(scans, TIMES), scan_messages(scans, TIMES + 0.05, frame="rear")
+        path = example.write_mcap(tmp_path / "t.mcap", sorted([*front, *rear], key=lambda message: message[3]))
+        with pytest.raises(InputError, match=r"t\.mcap: /points: expected scans of one sensor, .* got lidar, rear"):
+            open_recording(path)
     lying, turned = scan_messages(scans, TIMES), scan_messages(scans, TIMES[[0, 1, 3, 2, 4, 5]])
     lying[0][2]["point_step"] = 16
     off, none = (
