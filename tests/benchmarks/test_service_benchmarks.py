@@ -22,20 +22,20 @@ from saga_fg.errors import SagaError
 
 @pytest.fixture(scope="module")
 def rows() -> list[dict[str, Any]]:
-    return [{"table": title, **row} for title, row in endurance(200, "kalman,fixed-lag", 60, 20, 0)]
+    return [{"table": title, **row} for title, row in endurance(100, "kalman,fixed-lag", 30, 10, 0)]
 
 
 def test_tracks_begin_and_end_and_nothing_is_lost_whatever_the_traffic(rows):
     long = [row for row in rows if row["table"] == LONG]
-    assert [(row["estimator"], row["frames"]) for row in long] == [("kalman", 200), ("fixed-lag", 50)]
+    assert [(row["estimator"], row["frames"]) for row in long] == [("kalman", 100), ("fixed-lag", 40)]
     assert long[0]["tracks"] > 3 * long[0]["reported"] > 9
     assert all(row["files, last - second"] == 0 for row in long)
     for row in (row for row in rows if row["table"] == NONE):
         assert row["apart"] < 0.01
         assert row["reported, old / fresh"] == pytest.approx(1.0, abs=0.02)
     found = {(row["case"], row["size"]): row["reported"] for row in rows if row["table"] == EDGES}
-    assert (found["detections in a frame", 6], found["detections in a frame", 60]) == (6, 60)
-    assert found["sensors", 1] == found["sensors", 20] > 3
+    assert (found["detections in a frame", 3], found["detections in a frame", 30]) == (3, 30)
+    assert found["sensors", 1] == found["sensors", 10] > 3
     assert found["position, m", 0.0] == found["position, m", 9e8] > 3
 
 
@@ -103,9 +103,9 @@ FINE |= {"memory_growth": 1.01, "full_disk_told": True, "second_refused": True}
 
 
 def test_no_good_frame_is_lost_or_doubled_by_kills_and_floods():
-    found = bench_hostile_service(messages=400, objects=3, pace=20.0, seed=0)
-    assert [found[name] for name in ("valid", "answered", "lost", "doubled", "hostile")] == [80, 80, 0, 0, 320]
-    assert 0 < found["tracked"] <= 80 - found["late"] - found["unconfirmed"]
+    found = bench_hostile_service(messages=240, objects=3, pace=20.0, seed=0)
+    assert [found[name] for name in ("valid", "answered", "lost", "doubled", "hostile")] == [48, 48, 0, 0, 192]
+    assert 0 < found["tracked"] <= 48 - found["late"] - found["unconfirmed"]
     assert found["full_disk_told"]
     assert found["second_refused"]
     assert all(found[name] > 0 for name in ("refused", "sent_again", "first_answer"))

@@ -222,7 +222,7 @@ def test_the_files_that_are_read_are_not_overwritten(learned, detections):
 
 # Noise learned from simulated traffic, with and without ground truth, is the noise the sensors were simulated with
 
-WORLD = SimulatorSettings(duration=6.0)
+WORLD = SimulatorSettings(duration=4.0)
 WORST = 1.35  # factor between what was learned and the truth, at ranges where traffic is
 
 
