@@ -25,7 +25,7 @@ from data_tools.datasets.detection_files import prediction_writer, predictions_p
 from saga_fg import Dataset, GreedyTracker, InputError, PredictedTracks, Scene, Tracker, Tracks
 from saga_fg.numerics import FloatArray
 from saga_fg.tracking import SensorTime, Stage, TrackerView
-from saga_fg.types import within_reach
+from saga_fg.types import HIDDEN, within_reach
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc
 LARGE = 2**18  # bytes
@@ -118,7 +118,7 @@ def track_scene(
                     progress(scene.name, done, total)
             wanted.append(latest if latest is not None and latest.timestamp == moment else tracker.tracks(moment))
             if horizons is not None and latest is not None:
-                predicted += _predicted(tracker, moment, horizons, latest.timestamp)
+                predicted += _predicted(tracker, wanted[-1], horizons, latest.timestamp)
     clocks, noise = compared_clocks(tracker), {name: one.scale for name, one in tracker.sensor_noise.items()}
     return TrackedScene(scene, tuple(wanted), tuple(milliseconds), tuple(predicted), clocks, noise)
 
@@ -129,14 +129,13 @@ def compared_clocks(tracker: OnlineTracker) -> dict[str, SensorTime]:
     return clocks if len(clocks) > 1 else {}
 
 
-def _predicted(
-    tracker: OnlineTracker, moment: float, horizons: FloatArray, newest: float
-) -> tuple[PredictedTracks, ...]:
-    """The tracks at times after a moment; none where the newest frame is too far from it."""
+def _predicted(tracker: OnlineTracker, now: Tracks, horizons: FloatArray, newest: float) -> tuple[PredictedTracks, ...]:
+    """The tracks `now` at times after it, hidden ones with modes; none where the newest frame is too far from it."""
     if isinstance(tracker, GreedyTracker):
         raise InputError("--predict: expected a method that predicts, saga or kf")
-    reached = within_reach(horizons + (moment - newest))
-    return (tracker.predict(horizons, since=moment),) if reached else ()
+    if not within_reach(horizons + (now.timestamp - newest)):
+        return ()
+    return (tracker.predict(horizons, since=now.timestamp, hypotheses=bool((now.coasting > HIDDEN).any())),)
 
 
 def track_dataset(

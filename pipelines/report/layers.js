@@ -147,10 +147,11 @@ function drawTracks(view) {
 
 const shortName = name => name.split("-").pop();
 
-function drawIds(view) {  // that of the followed track first
+function drawIds(view) {  // that of the followed track first, then modes of hidden ones
   const order = [...view.tracks].sort((a, b) => (b === view.focus) - (a === view.focus) || b[SCORE] - a[SCORE]);
-  drawTexts(view, order.map(row => ({at: middle(row), text: shortName(view.result.ids[row[ID]]), bold: row === view.focus,
-    alpha: pale(view, row), colour: view.colour(row)})));
+  const ids = order.map(row => ({at: middle(row), text: shortName(view.result.ids[row[ID]]), bold: row === view.focus,
+    alpha: pale(view, row), colour: view.colour(row)}));
+  drawTexts(view, [...ids.filter(each => each.bold), ...view.names, ...ids.filter(each => !each.bold)]);
 }
 
 function drawTexts({g}, texts) {  // those with a place free of the ones before, and bold ones

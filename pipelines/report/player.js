@@ -105,7 +105,7 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
     views = methods.map((name, pane) => {
       const followed = picked?.method === name ? picked.id : null;
       const tracks = filters.rows(scene, name, k, followed);
-      const view = {g, thin: 1 / zoom, step, scene, k, name, result: scene.methods[name], tracks,
+      const view = {g, thin: 1 / zoom, step, scene, k, name, result: scene.methods[name], tracks, names: [], fans: [],
         focus: tracks.find(row => row[ID] === followed) ?? null,
         colour: row => filters.colour(scene, row), shownClass: label => filters.shownClass(scene, label)};
       g.save();
@@ -285,6 +285,7 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
   };
   canvas.onpointermove = e => {
     pointer = under(e)[1];
+    canvas.title = modeAt(...under(e));
     if (!held) return;
     if (edited) { editor.drag(under(e)[1]); return; }
     const dx = e.clientX - held[0], dy = e.clientY - held[1];

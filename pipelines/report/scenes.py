@@ -5,19 +5,20 @@ Scenes as data of the page's player: rows of whole numbers, centimetres and mill
     scene   {"name", "start": s, "origin": [x, y] in m, "times": [s], "ego": [[x, y, yaw]], "labels": [class],
              "methods": {name: {"ids": [name],
              "moments": [[track, ...]], "edges": [[[target id, source id, rate, relation], ...]], "relations": [name],
-             "horizons": [ms], "predictions": [[prediction, ...]], [] without}},
+             "horizons": [ms], "predictions": [[prediction, ...]], [] without, "modes": [name]}},
              "truth": [[object, ...]], "detections": [[detection, ...]], "road": see below,
              "map": {"areas": [[kind, ring, ...]], "lines": [[x, y, ...]]} or null, "cameras": {name: [JPEG]},
              "comparisons": [{"reference": name of a method, null for the truth, "found": name, "events": [event]}]}
     track      [id, class, x, y, length, width, yaw, vx, vy, score, cov_xx, cov_xy, cov_yy, coasting]
-    prediction [id, horizon, x, y, cov_xx, cov_xy, cov_yy]
+    prediction [id, horizon, x, y, cov_xx, cov_xy, cov_yy, mode, probability]; mode 0: the mean of all
     object     [class, x, y, length, width, yaw, visible]
     detection  [class, x, y, length, width, yaw, score]
     event      [kind, first moment, last moment, x, y, id of the reference, id found, id found before]
 
-Lengths in cm, yaw in mrad, velocities in cm/s, scores and rates in thousandths, covariances in cm^2, coasting and
-horizons in ms; null is unknown. `ids`, `labels`, `relations` are counted from 0. Ids of events are names. The kinds of
-events are `SWITCH`, `UNMATCHED`, a box of the reference without one found, and `ADDED`, one found without a box of it.
+Lengths in cm, yaw in mrad, velocities in cm/s, scores, rates, probabilities in thousandths, covariances in cm^2,
+coasting and horizons in ms; null is unknown. `ids`, `labels`, `relations`, `modes` are counted from 0. Ids of events
+are names. The kinds of events are `SWITCH`, `UNMATCHED`, a box of the reference without one found, and `ADDED`, one
+found without a box of it.
 
 The road of a scene as the page's player wants it: lanes, stop lines and lights that its frames brought along.
 
@@ -349,22 +350,25 @@ def predictions_data(
 ) -> dict[str, Any]:
     """Return the predictions of the tracks of a table; see the module's docstring."""
     if found is None:
-        return {"horizons": [], "predictions": []}
+        return {"horizons": [], "predictions": [], "modes": []}
     number = _numbers(np.unique(table.id).tolist())
     ids = np.array([number.get(id_, -1) for id_ in found.id.tolist()], dtype=np.int64)
     found, ids = found.select(ids >= 0), ids[ids >= 0]
-    P = found.covariance
+    P, (modes, mode) = found.covariance, np.unique(["", *found.mode], return_inverse=True)
     columns = [
         ids,
         1000 * found.horizon,
         100 * (found.position - origin),
         1e4 * np.stack([P[:, 0, 0], P[:, 0, 1], P[:, 1, 1]], axis=-1),
+        mode[1:],
+        1000 * found.probability,
     ]
-    order = np.lexsort((found.horizon, ids, found.timestamp))
+    order = np.lexsort((found.horizon, mode[1:], ids, found.timestamp))
     rows = _whole(np.column_stack(columns)[order])
     starts = np.searchsorted(found.timestamp[order], [*(times - _SAME_TIME), np.inf]).tolist()
     horizons = np.unique((1000 * found.horizon).round()).astype(np.int64)
-    return {"horizons": horizons.tolist(), "predictions": [rows[a:b] for a, b in pairwise(starts)]}
+    moments = [rows[a:b] for a, b in pairwise(starts)]
+    return {"horizons": horizons.tolist(), "predictions": moments, "modes": modes.tolist()}
 
 
 def _numbers(ids: Sequence[str]) -> dict[str, int]:

@@ -39,7 +39,7 @@ from saga_fg.tracking.track_filters import MOVING, TURNING, Kinematics
 from saga_fg.tracking.track_life import reported_rows, untrackable
 from saga_fg.tracking.tracker_state import TrackerState
 from saga_fg.tracking.traffic import STEP, paths, straight_paths
-from saga_fg.types import VEHICLES, Hypothesis, PredictedMode, PredictedTracks
+from saga_fg.types import HIDDEN, VEHICLES, Hypothesis, PredictedMode, PredictedTracks
 
 ACROSS = 0.3  # m/s, deviation of the velocity of a vehicle across its path: it moves within its lane
 LEAVING = 1.0  # m/s, where no earlier traffic tells the path: it may turn, or leave its lane
@@ -157,7 +157,6 @@ def _at(column: FloatArray, distance: FloatArray) -> FloatArray:
 
 log = logging.getLogger(__name__)
 
-SEEN = 0.3  # s since its last detection, for which an object counts as detected
 MIN_EXISTENCE = 0.1  # below, a coasting track that was never confirmed has no edges: most tracks, hardly an object
 MAX_STEPS = 100  # that an interval is predicted in
 LOOKAHEAD_STEP = 0.5  # s, the longest with the same edges; a shorter `max_step` counts
@@ -207,7 +206,7 @@ def judge_edges(state: TrackerState) -> None:
     """Compare what edges said of detected objects with what these did, let them say it again, judge right of way."""
     if state.settings.edge_prior == 1 or not any(answers(rule) for rule in state.rules):
         return
-    nodes, seen, time = node_table(state), state.table.coasting(state.time) <= SEEN, state.time
+    nodes, seen, time = node_table(state), state.table.coasting(state.time) <= HIDDEN, state.time
     state.halting = state.halting.later(nodes, seen, time)
     state.edge_record = state.edge_record.later(state.rules, nodes, seen, time)
     if state.right_of_way.due(time):
@@ -273,7 +272,7 @@ def look_ahead(
     Left out are tracks that can't be predicted to the last of them. joint: with their joint covariances. hypotheses:
     where edges answer for themselves, the modes of those that move are to wait, to follow and to go on.
     """
-    newest, reported = state.clock.newest, state.table.id[reported_rows(state)]
+    newest, start, reported = state.clock.newest, state.time, state.table.id[reported_rows(state)]
     cases = _hypotheses(state) if hypotheses and state.settings.edge_prior < 1 else []
     tables, expected, moving, together = [], [], [], []
     for horizon in horizons.tolist():
@@ -304,7 +303,15 @@ def look_ahead(
     modes.append(PredictedMode("stationary", stands, **_world_columns(state, standing)))
     mean = _world_columns(state, [now.select(rows) for now, rows in zip(expected, kept, strict=True)])
     return PredictedTracks(
-        newest, horizons, last.id, last.label, yaw=yaw, **mean, modes=tuple(modes), joint_covariance=whole
+        newest,
+        horizons,
+        last.id,
+        last.label,
+        yaw=yaw,
+        **mean,
+        coasting=last.coasting(start),
+        modes=tuple(modes),
+        joint_covariance=whole,
     )
 
 

@@ -50,6 +50,7 @@ from .road_map import (
     updated,
 )
 from .track import (
+    HIDDEN,
     LONGEST_PREDICTION,
     POSITION_COVARIANCE,
     RELATIONS,
@@ -74,6 +75,7 @@ __all__ = [
     "COLOUR_LABELS",
     "DEFAULT",
     "FILL_IN",
+    "HIDDEN",
     "LANE",
     "LATEST",
     "LIGHT",

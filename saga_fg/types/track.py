@@ -310,6 +310,9 @@ class PredictedMode:
 LEAST_MODE = 1e-3
 """Probability below which a mode is left out of tables."""
 
+HIDDEN, SHOWN_MODE = 0.3, 0.05
+"""Seconds without detection from which an object is hidden, and the least probability of its modes that are shown."""
+
 
 @dataclass(frozen=True, eq=False)
 class PredictedTracks(ShownTable):
@@ -323,6 +326,7 @@ class PredictedTracks(ShownTable):
     yaw                  (H, N)        heading, rad; NaN where it is unknown
     position_covariance  (H, N, 2, 2)  m^2
     velocity_covariance  (H, N, 2, 2)  (m/s)^2
+    coasting             (N,)          s since the last detection
     modes                              moving and stationary, of which mean and covariance are the mixture's; if
                                        hypotheses were asked for, waits, follows and goes on stand for moving, beside
                                        the same mean and covariance
@@ -338,6 +342,7 @@ class PredictedTracks(ShownTable):
     yaw: FloatArray
     position_covariance: FloatArray
     velocity_covariance: FloatArray
+    coasting: FloatArray
     modes: tuple[PredictedMode, ...]
     joint_covariance: FloatArray | None = None
 
@@ -348,7 +353,7 @@ class PredictedTracks(ShownTable):
         none, vectors, matrices = np.empty((h, 0)), np.empty((h, 0, 2)), np.empty((h, 0, 2, 2))
         ids, label = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.str_)
         modes = (PredictedMode("moving", none, vectors, vectors, matrices, matrices),)
-        return cls(timestamp, horizons, ids, label, vectors, vectors, none, matrices, matrices, modes)
+        return cls(timestamp, horizons, ids, label, vectors, vectors, none, matrices, matrices, np.empty(0), modes)
 
     def __len__(self) -> int:
         return len(self.id)
@@ -362,10 +367,11 @@ class PredictedTracks(ShownTable):
         """Return a `pandas.DataFrame` of `table_columns`. Raises `MissingExtraError` without pandas."""
         return data_frame(self.table_columns())
 
-    def table_columns(self, modes: bool = False) -> dict[str, Any]:
+    def table_columns(self, modes: bool = False, hidden: bool = False) -> dict[str, Any]:
         """Return the columns of a table, a row for each horizon and track, named as in the files of `--predict`.
 
-        modes: a row for each mode, with its name and probability, in place of their mean and covariance
+        modes: a row for each mode, with its name and probability, in place of their mean and covariance. hidden: those
+        alone of objects without detection that may go on in several ways.
         """
         if not modes:
             return self._names() | self._state_columns(self)
@@ -377,7 +383,11 @@ class PredictedTracks(ShownTable):
         ]
         whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         order = np.arange(len(whole["id"])).reshape(len(parts), -1).T.ravel()  # the modes of a track together
-        order = order[whole["probability"][order] >= LEAST_MODE]
+        share = np.stack([mode.probability for mode in self.modes])
+        kept = share >= (SHOWN_MODE if hidden else LEAST_MODE)
+        if hidden:
+            kept &= (kept.sum(axis=0) > 1) & (self.coasting > HIDDEN)
+        order = order[kept.ravel()[order]]
         return {name: column[order] for name, column in whole.items()}
 
     def _names(self) -> dict[str, Any]:

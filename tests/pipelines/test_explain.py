@@ -7,7 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_tools.datasets.detection_files import PREDICTION_COLUMNS, predictions_path, read_predictions
+from data_tools.datasets.detection_files import (
+    PREDICTION_COLUMNS,
+    prediction_writer,
+    predictions_path,
+    read_predictions,
+)
 from data_tools.simulator import SimulatedTraffic, SimulatorSettings
 from pipelines.config import load_config
 from pipelines.explaining import journal_of, read_relations, read_track, story
@@ -15,7 +20,8 @@ from pipelines.report import Report, report_page, scene_of_run
 from pipelines.report.scenes import relations_data, scene_data
 from pipelines.serving.messages import tracks_message
 from pipelines.tracking import TrackedScene, track_scene
-from saga_fg import InputError, Tracks
+from saga_fg import Boxes, Detections, Frame, InputError, Scene, Tracker, Tracks
+from saga_fg.tracking.table_tracking import dense_traffic_settings
 from saga_fg.types import RELATIONS, Relations
 from tests.pipelines.command import done, refused, saga_fg
 from tests.pipelines.page_in_browser import tried_in_browser
@@ -200,6 +206,32 @@ def test_the_table_is_read_back_as_it_was_made(detections, tmp_path):
     assert saga_fg("track", "file", detections / "a.csv", "--output", tracks).exit_code == 0
     assert not table.exists()  # of another run
     assert read_predictions(tracks) == {}
+
+
+def test_hidden_tracks_alone_are_kept_with_their_modes(tmp_path):
+    """A car whose leader is seen is hidden from 4 s on: it follows, or it goes on or stands."""
+    frames, path = [], tmp_path / "t.csv"
+    for k in range(50):
+        places = [(1.0 * k + 20.0 - 0.01 * max(k - 30, 0) ** 2, 0.0, 0.8), (1.0 * k, 0.0, 0.8)][: 2 if k < 40 else 1]
+        boxes = Boxes.of(["car"] * len(places), places, [[4.5, 1.8, 1.6]] * len(places), [0.0] * len(places))
+        frames.append(Frame(0.1 * k, "lidar", Detections(boxes, np.full(len(places), 0.9))))
+    times = np.array([frame.timestamp for frame in frames])
+    scene = Scene("a", times, np.tile(np.eye(4), (len(times), 1, 1)), ("",) * len(times), tuple(frames))
+    settings = replace(dense_traffic_settings(), edge_prior=0.5)
+    run = track_scene(scene, Tracker(settings), horizons=HORIZONS)
+    with prediction_writer(predictions_path(path)) as write:
+        write("a", run.predictions)
+    (rows,) = read_predictions(path).values()
+    named = rows.select(np.flatnonzero(rows.mode != ""))
+    (hidden,) = run.tracks[-1].id[run.tracks[-1].coasting > 0.5].astype(str)
+    assert set(named.id.tolist()) == {hidden}
+    assert named.timestamp.min() > 4.0
+    assert {"follows", "goes on"} <= set(named.mode.tolist())
+    assert named.probability.min() >= 0.05
+    shown = scene_data(scene_of_run({"saga": run}, (), {}))["methods"]["saga"]
+    assert shown["modes"][0] == ""
+    last = [row for row in shown["predictions"][-1] if row[7]]
+    assert [shown["modes"][row[7]] for row in last if row[1] == 2000] == sorted(set(named.mode[named.timestamp > 4.85]))
 
 
 def test_parallel_runs_keep_a_table_for_each_part(detections, tmp_path):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from data_tools.datasets.argoverse2.source import ArgoverseSource
+from data_tools.datasets.detection_files import PredictionRows
 from data_tools.datasets.kitti.source import KittiSource
 from data_tools.datasets.nuscenes import NuScenes
 from data_tools.datasets.nuscenes.source import NuScenesSource
@@ -171,6 +172,43 @@ def test_a_class_has_one_colour_in_player_charts_and_figures(tmp_path):
     for name, colour in class_colours(["bollard", "pedestrian"]).items():
         assert found[name] == [colour, f"rgb({', '.join(map(str, bytes.fromhex(colour[1:])))})"]
     assert found["all"][0] not in (found["bollard"][1], found["pedestrian"][1])
+
+
+def test_a_hidden_track_shows_where_each_of_its_modes_leads(tmp_path):
+    """Of two cars the page has means, and of the hidden one two modes; the likelier one is drawn stronger."""
+    known = scene("first")
+    columns = [(k, id_, "", 1.0) for k in range(MOMENTS) for id_ in ("1", "6")]
+    columns += [(k, "6", *mode) for k in range(4, MOMENTS) for mode in (("waits", 0.7), ("goes on", 0.3))]
+    moment, ids, modes, share = (np.array(each) for each in zip(*columns, strict=True))
+    ahead = np.array([{"waits": 20.0}.get(mode, 40.0) for mode in modes.tolist()])
+    place = np.column_stack([2.5 * moment + ahead, [{"1": 0.0}.get(id_, -12.0) for id_ in ids.tolist()]])
+    spread = np.tile(np.eye(2), (len(ids), 1, 1))
+    found = PredictionRows(0.5 * moment, np.full(len(ids), 2.0), ids, place, spread, modes, share)
+    page = report_page(Report("modes", [], [replace(known, predictions={"whole": found})]))
+    script = """
+  const view = $of("view"), g = view.getContext("2d");
+  const placed = (x, y) => pixel(x - 2.5 * Number($of("time").value), y, view.clientWidth);
+  const strength = (x, y) => {
+    const data = g.getImageData(...placed(x, y).map(v => Math.round(v) - 3), 7, 7).data;
+    return data.filter((v, i) => i % 4 === 3).reduce((sum, v) => sum + v, 0);
+  };
+  const over = (x, y) => {
+    const [a, b] = placed(x, y), {left, top} = view.getBoundingClientRect();
+    view.dispatchEvent(new PointerEvent("pointermove", {clientX: left + a, clientY: top + b}));
+    return view.title;
+  };
+  $of("method").value = "whole"; $of("method").onchange?.(); $of("show-grid").click(); $of("show-ids").click();
+  at(6); $of("show-fans").checked || $of("show-fans").click();
+  found.hidden = over(35, -12);
+  $of("show-ghosts").click();
+  found.shown = [over(35, -12), over(55, -12), over(55, 0)];
+  found.strength = [strength(35.7, -12), strength(55.7, -12)];
+"""
+    found = tried_in_browser(page, HELPERS + script, tmp_path)
+    assert found["faults"] == []
+    assert found["hidden"] == ""
+    assert found["shown"] == ["track 6 waits: 70 %, in 2 s", "track 6 goes on: 30 %, in 2 s", ""]
+    assert found["strength"][0] > 1.3 * found["strength"][1] > 0
 
 
 def test_a_link_leads_to_a_moment_and_a_track(tmp_path):

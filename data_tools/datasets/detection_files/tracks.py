@@ -292,7 +292,14 @@ def _covariance(raw: RawTable, names: tuple[str, str, str]) -> FloatArray:
     return from_upper_triangle(np.stack([raw.numbers(name) for name in names], axis=-1))
 
 
-PREDICTION_COLUMNS = ("scene", *PredictedTracks.empty(0.0, np.zeros(1)).table_columns())
+def prediction_columns(predicted: PredictedTracks) -> dict[str, Any]:
+    """Columns of a table: the mean of each track at each horizon, `mode` "", then the modes of hidden tracks."""
+    mean, modes = predicted.table_columns(), predicted.table_columns(modes=True, hidden=True)
+    mean |= {"probability": np.ones(len(mean["id"])), "mode": np.full(len(mean["id"]), "")}
+    return {name: np.concatenate([column, modes[name]]) for name, column in mean.items()}
+
+
+PREDICTION_COLUMNS = ("scene", *prediction_columns(PredictedTracks.empty(0.0, np.zeros(1))))
 SUFFIX = ".predictions.csv"
 
 
@@ -301,6 +308,7 @@ class PredictionRows(Columns):
     """R predicted positions.
 
     timestamp (R,) of the moment, s; horizon (R,), s; id (R,); position (R, 2), m; covariance (R, 2, 2), m^2
+    mode (R,) "" for the mean of a track, else the name of one of its modes, and probability (R,) of this
     """
 
     timestamp: FloatArray
@@ -308,11 +316,13 @@ class PredictionRows(Columns):
     id: StrArray
     position: FloatArray
     covariance: FloatArray
+    mode: StrArray
+    probability: FloatArray
 
     @classmethod
     def from_moments(cls, moments: Sequence[PredictedTracks]) -> Self:
         """The rows of what was predicted at several moments."""
-        tables = [each.table_columns() for each in (PredictedTracks.empty(0.0, np.zeros(1)), *moments)]
+        tables = [prediction_columns(each) for each in (PredictedTracks.empty(0.0, np.zeros(1)), *moments)]
         columns = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
         return cls(
             columns["timestamp"],
@@ -320,6 +330,8 @@ class PredictionRows(Columns):
             columns["id"].astype(np.str_),
             np.stack([columns["x"], columns["y"]], axis=-1),
             from_upper_triangle(np.stack([columns[name] for name in POSITION_COVARIANCE], axis=-1)),
+            columns["mode"],
+            columns["probability"],
         )
 
 
@@ -338,11 +350,11 @@ def prediction_writer(path: Path) -> Iterator[Callable[[str, Sequence[PredictedT
 
 
 def _prediction_rows(scene: str, predicted: PredictedTracks) -> Iterator[list[Any]]:
-    columns = predicted.table_columns()
-    exact = [columns.pop(name).tolist() for name in ("timestamp", "horizon", "id", "label")]
+    columns = prediction_columns(predicted)
+    exact = [columns.pop(name).tolist() for name in ("timestamp", "horizon", "id", "label", "mode")]
     numbers = np.column_stack(list(columns.values())).tolist()
-    for *names, row in zip(*exact, numbers, strict=True):
-        yield [scene, *names, *(None if x != x else round(x, 4) for x in row)]
+    for *names, mode, row in zip(*exact, numbers, strict=True):
+        yield [scene, *names, *(None if x != x else round(x, 4) for x in row), mode]
 
 
 def predictions_path(result: Path) -> Path:
@@ -382,6 +394,8 @@ def _read_table(path: Path) -> dict[str, PredictionRows]:
         columns["id"].astype(np.int64).astype(np.str_),
         np.stack([columns["x"], columns["y"]], axis=-1),
         _covariance(raw, POSITION_COVARIANCE),
+        raw.texts("mode", ""),
+        np.nan_to_num(raw.numbers("probability"), nan=1.0),
     )
     scene = raw.texts("scene", Path(path.name.removesuffix(SUFFIX)).stem)
     return {str(name): rows.select(np.flatnonzero(scene == name)) for name in np.unique(scene)}
