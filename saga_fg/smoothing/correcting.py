@@ -290,8 +290,9 @@ class _Edits:
         free = object_of < 0
         object_of = assign_free_detections(evidence, object_of, lifespans, states, ASSOCIATION_GATE, MAX_FREE_DISTANCE)
         track_of[free & (object_of >= 0)] = -1
-        mine, lifespans = lives()
-        states = passes.alone(lifespans, mine, EXTENSION)
+        if (object_of[free] >= 0).any():
+            mine, lifespans = lives()
+            states = passes.alone(lifespans, mine, EXTENSION)
         within = states.within(lifespans)
         found = stationary_states(within, lifespans, evidence, mine, settings.position_drift, settings.classes)
         held = self._held(within, evidence)
