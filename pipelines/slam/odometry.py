@@ -61,8 +61,10 @@ _CLEARLY, _SKEWED = 0.9, 3  # of the residual; rounds that take the skew out of 
 _UNKNOWN_SPEED = 10.0  # m/s, standard deviation of a speed that nothing has shown yet
 _UNKNOWN_ACCELERATION = 1.0  # m/s^2/sqrt(Hz), of a vehicle along a motion that scans leave open
 _LOST, _POOR, _WORSE = 0.75, 0.85, 2.0  # of the usual share of points with pairs, and of the usual residual
+_ALIKE = 0.85  # of the usual residual, where a scan is found again: there it has .4 to .7, in another street 1 to 2
 _USUAL = 0.1  # weight of the newest scan in what is usual
-_BEGIN_ANEW = 10  # scans in a row that do not fit, after which they enter the map all the same
+_ELSEWHERE, _BEGIN_ANEW = 3, 10  # scans in a row that do not fit: carried further; they enter the map all the same
+_ANYWHERE = np.diag([0.1, 0.1, 1.0, 30.0, 30.0, 3.0]) ** 2  # rad^2, m^2, of a motion that nothing shows
 _SHIFTS, _TURNS = np.arange(-12.0, 12.1, 1.5), np.linspace(-np.pi, np.pi, 36, endpoint=False)  # m, rad: where to look
 _SCAN_SPACING = 1.5  # m, of the points that are registered: KISS-ICP's, 1.5 of its voxels of a metre
 _STANDING_POINTS, _TRIED = 60, 10  # of a scan that are laid on the map; places that are registered
@@ -119,6 +121,7 @@ class LidarOdometry:
         self._velocity_known = False  # by a scan that showed the whole motion, or by other sensors
         self._confirmed: float | None = None  # s, when a scan showed the whole motion, or a speed was taken after one
         self._misfits = 0  # scans in a row that did not fit
+        self._places: list[FloatArray] = []  # (3,) of scans in the map, m
         self._open: tuple[float, float] | None = None  # since when motions are open, s, and deviation of the speed
         self._registered: OdometryStep | None = None  # the last one that was registered, or the first
         self._lost = 0  # scans since then
@@ -167,6 +170,7 @@ class LidarOdometry:
             self._keyframe = placed.map_T_lidar
             points = scan.points[voxel_downsample(scan.points, s.map_spacing)]
             self._map.add(transform_points(placed.map_T_lidar, points), placed.map_T_lidar[:3, 3])
+            self._places.append(placed.map_T_lidar[:3, 3])
         return placed
 
     def _within_range(self, scan: Scan, timestamp: float) -> Scan:
@@ -272,13 +276,21 @@ class LidarOdometry:
             _LOG.warning("scan at %.3f s: %s; the motion of the one before goes on", timestamp, why)
             return OdometryStep(timestamp, predicted, lost, scan, False, None)
         self._adapt(inverse_transform(predicted) @ found.map_T_scan, points)
-        before = self._registered or last
+        before = last if self._misfits > 1 else self._registered or last
         since_then = inverse_transform(before.map_T_lidar) @ found.map_T_scan
         self._velocity = constant_velocity(since_then, timestamp - before.timestamp)
-        in_doubt = 0 < self._misfits < _BEGIN_ANEW
-        keyframe = not in_doubt and moved_on(inverse_transform(self._keyframe) @ found.map_T_scan)
+        if self._misfits == _ELSEWHERE:
+            _LOG.warning(
+                "scan at %.3f s: it fits the map nowhere, as the scans before it: lost, its place is unknown", timestamp
+            )
+        if 0 < self._misfits < _BEGIN_ANEW:
+            lost = _ANYWHERE if self._misfits == _ELSEWHERE else lost
+            return OdometryStep(timestamp, found.map_T_scan, lost, scan, False, None)
+        keyframe = moved_on(inverse_transform(self._keyframe) @ found.map_T_scan)
         names = found.observed.names(self._velocity[3:] if np.linalg.norm(self._velocity[3:]) > _STANDING else None)
         covariance = found.covariance + self._of_open_motions(found.observed, last.timestamp, timestamp)
+        if self._misfits == _BEGIN_ANEW:
+            covariance = covariance + _ANYWHERE
         self._velocity_known |= not names
         if not names:
             self._confirmed = timestamp
@@ -310,7 +322,9 @@ class LidarOdometry:
         return good
 
     def _found_again(self, points: FloatArray, thin: FloatArray) -> Registration | None:
-        """The registration of a scan that does not fit where it was expected, near the last one that did; None: none.
+        """The registration of a scan that does not fit where it was expected; None: none.
+
+        It is looked for near the last one that did, and after several all along the path that is in the map.
 
         What stands above the ground is laid on the map in all directions. The places with most of it on the map are
         registered, and the first where the scan fits as scans before it is taken.
@@ -321,13 +335,16 @@ class LidarOdometry:
         standing = Structure.of(points).points[:, :2]
         if len(standing) < _STANDING_POINTS:
             return None
+        level = centre.map_T_lidar @ upright(centre.map_T_lidar)
         x, y, yaw = (a.ravel() for a in np.meshgrid(_SHIFTS, _SHIFTS, _TURNS, indexing="ij"))
+        if self._misfits >= _ELSEWHERE - 1:
+            at = self._apart(transform_points(inverse_transform(level), np.array(self._places)))
+            x, y, yaw = np.add.outer(at[:, 0], x).ravel(), np.add.outer(at[:, 1], y).ravel(), np.tile(yaw, len(at))
         c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
         few = standing[:: len(standing) // _STANDING_POINTS]
         turned = np.stack(
             [c * few[:, 0] - s * few[:, 1] + x[:, None], s * few[:, 0] + c * few[:, 1] + y[:, None]], axis=2
         )
-        level = centre.map_T_lidar @ upright(centre.map_T_lidar)
         around = Structure.of(transform_points(inverse_transform(level), self._map.surfels.mean)).points
         distance, _ = cKDTree(around[:, :2]).query(turned, distance_upper_bound=self.settings.surfel_size)
         for row in np.argsort(-np.isfinite(distance).mean(axis=1), kind="stable")[:_TRIED].tolist():
@@ -337,9 +354,18 @@ class LidarOdometry:
                 found = register(thin, self._map, rough.map_T_scan, self.settings.surfel_size, 0.1)
             except RegistrationError:
                 continue
-            if found.converged and self._fits(found, len(thin)):
+            alike = found.residual <= _ALIKE * self._usual[1]
+            if found.converged and alike and self._fits(found, len(thin)):
                 return found
         return None
+
+    def _apart(self, places: FloatArray) -> FloatArray:
+        """Those of some places (n, 3) that are in the map, from the last to the first, as far apart as is searched."""
+        found = [np.zeros(3)]
+        for place in places[::-1][np.linalg.norm(places[::-1], axis=1) < self.settings.max_range]:
+            if np.linalg.norm(np.array(found) - place, axis=1).min() >= 2 * _SHIFTS[-1]:
+                found.append(place)
+        return np.array(found)
 
     def _adapt(self, deviation: FloatArray, points: FloatArray) -> None:
         span = float(np.median(np.linalg.norm(points, axis=1)))

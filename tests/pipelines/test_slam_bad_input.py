@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.scans import SimulatedScans
+from benchmarks.scans import SMALL, SimulatedScans, drive, simulate_scan, street
 from data_tools.lidar import Scan
 from pipelines.slam.drive import motion, shared
 from pipelines.slam.lidar_slam import LidarSlam, LidarSlamSettings
@@ -16,7 +16,7 @@ from pipelines.slam.odometry import LidarOdometry, OdometryStep
 from pipelines.slam.vehicle_sensors import Vehicle, mean_speed
 from saga_fg import Detections, InputError
 from saga_fg.graph import Additions, GraphView
-from saga_fg.numerics import yaw_transform
+from saga_fg.numerics import inverse_transform, yaw_transform
 from saga_fg.types.frame import EgoMeasurements, GpsFix, Observation, WheelSpeed
 
 NOTHING = Scan.of(np.empty((0, 3)))
@@ -66,6 +66,27 @@ def test_lost_scans_leave_the_drive_as_it_was(scans: SimulatedScans) -> None:
     assert deviations[9 + count] < 0.1
     error = np.linalg.norm(slam.finish().trajectory.positions - scans.world_T_ego[:, :3, 3], axis=1)
     assert error.max() < 0.15
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_carried_further_than_nearby(known: bool, caplog: pytest.LogCaptureFixture) -> None:
+    """20 m back, where the map has the place; and into another street, of which nothing tells how far it is."""
+    rng, poses, odometry, variance = np.random.default_rng(0), drive(40), LidarOdometry(), 0.0
+    worlds = street(0), street(0 if known else 3)
+    for k in range(42):
+        row = k if k < 36 else k - 26
+        scan = simulate_scan(worlds[k >= 36], poses[row], rng, SMALL)
+        step = odometry.step(scan, 0.1 * k + 2.0 * (k >= 36))
+        variance += step.covariance[3, 3]
+    assert ("lost, its place is unknown" in caplog.text) != known
+    assert ("from where it was expected: moved" in caplog.text) == known
+    if known:
+        off = inverse_transform(poses[0]) @ poses[row]
+        np.testing.assert_allclose(step.map_T_lidar[:3, 3], off[:3, 3], atol=0.2)
+    else:
+        assert "lost, its place is unknown" in caplog.text
+        assert not step.keyframe
+        assert variance > 20.0**2
 
 
 def test_lost_scans_share_the_covariance_of_the_whole_motion() -> None:
