@@ -8,7 +8,8 @@ variance of a detection:
     s^2 = least over k = 1, 2, 3 of the 90 % quantile of ( D_k^T R^-1 D_k / sum of c_j^2 ) / chi^2_2(90 %)
 
 with R the noise by the sensor's model. Orders that motion is still part of are larger, so that the first alone never
-raises s, and the quantile is that up to which ellipses are meant to hold. The s of a class is drawn to that of all
+raises s; until there are others, those of successive frames do, of second order, in which hardly any motion
+is. The quantile is that up to which ellipses are meant to hold. The s of a class is drawn to that of all
 classes, as if they had `OF_GROUP` differences in it, that of a band of range to its class, and s^2 = a^2 + (g r)^2 is
 fitted to the bands. Until there are enough differences, gates are those of `UNKNOWN` times its noise: with too small
 ones a tracker would only see the small errors.
@@ -25,7 +26,7 @@ Source: von Neumann, Kent, Bellinson, Hart, The mean square successive differenc
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -64,6 +65,7 @@ class SensorNoise:
     seen     number of differences so far
     frames   the latest frames, oldest first, as far back as they are compared
     squares  by class and band of range
+    quick    of all, the latest squared differences of successive frames that are less than `STEP` apart
     """
 
     scale: float = 1.0
@@ -73,6 +75,7 @@ class SensorNoise:
     seen: int = 0
     frames: tuple[_Detections, ...] = ()
     squares: Mapping[tuple[str, int], _Squares] = field(default_factory=dict)
+    quick: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def observed(
         self, time: float, track: IntArray, position: FloatArray, R: FloatArray, label: StrArray, distance: FloatArray
@@ -89,12 +92,8 @@ class SensorNoise:
         frames = (*self.frames, (time, track, position))
         compared = _apart(frames)
         band = np.searchsorted(BANDS, distance)
-        common, rows, squares, seen = track, np.arange(len(track)), dict(self.squares), 0
-        columns = [position]
-        for order, (_, tracks, places) in enumerate(compared[1:], 1):
-            common, kept, before = np.intersect1d(common, tracks, assume_unique=True, return_indices=True)
-            rows, columns = rows[kept], [*(column[kept] for column in columns), places[before]]
-            found = _squares(np.array([at for at, _, _ in compared[: order + 1]]), np.stack(columns), R[rows])
+        squares, seen = dict(self.squares), 0
+        for order, (rows, found) in enumerate(_differences(compared, R), 1):
             seen += len(found)
             for group in set(zip(label[rows].tolist(), band[rows].tolist(), strict=True)):
                 mine = (label[rows] == group[0]) & (band[rows] == group[1])
@@ -102,8 +101,14 @@ class SensorNoise:
                 known[order - 1] = np.concatenate([known[order - 1], found[mine]])[-LATEST:]
                 squares[group] = tuple(known)
         needed = frames if len(compared) <= ORDERS[-1] else tuple(f for f in frames if f[0] >= compared[-1][0])
-        scale = _scale(list(squares.values()), 1.0, PRIOR)
-        return SensorNoise(scale, _growing(squares, scale), False, start, self.seen + seen, needed, squares)
+        quick, least = self.quick, 1.0
+        if len(frames) > 2 and time - frames[-3][0] < 2 * STEP - 1e-6:
+            *_, (_, found) = _differences(frames[:-4:-1], R)
+            quick = np.concatenate([quick, found])[-LATEST:]
+        if len(quick) >= FEWEST:
+            least = min(max(math.sqrt(float(np.quantile(quick, QUANTILE)) / gate(QUANTILE)), 1.0), MOST)
+        scale = _scale(list(squares.values()), least, PRIOR)
+        return SensorNoise(scale, _growing(squares, scale), False, start, self.seen + seen, needed, squares, quick)
 
     def scales(self, label: StrArray, distance: FloatArray) -> FloatArray:
         """(n,) s of detections of these classes (n,) at these distances (n,) from the sensor, m."""
@@ -122,6 +127,16 @@ def _apart(frames: Sequence[_Detections]) -> list[_Detections]:
         if len(found) <= ORDERS[-1] and found[-1][0] - frame[0] >= STEP - 1e-6:
             found.append(frame)
     return found
+
+
+def _differences(frames: Sequence[_Detections], R: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+    """By order, the rows (k,) of the first frame that all frames have tracks of, and their squares (k,) by R."""
+    _, common, position = frames[0]
+    rows, columns = np.arange(len(common)), [position]
+    for order, (_, tracks, places) in enumerate(frames[1:], 1):
+        common, kept, before = np.intersect1d(common, tracks, assume_unique=True, return_indices=True)
+        rows, columns = rows[kept], [*(column[kept] for column in columns), places[before]]
+        yield rows, _squares(np.array([at for at, _, _ in frames[: order + 1]]), np.stack(columns), R[rows])
 
 
 def _squares(time: FloatArray, position: FloatArray, R: FloatArray) -> FloatArray:

@@ -52,6 +52,12 @@ def test_motion_never_passes_for_noise_while_little_is_known():
         assert seen(0.3, lambda t: np.array([20 * t, 0.0]), rng, frames, objects=40).scale <= 1.15
 
 
+def test_large_noise_is_found_within_half_a_second():
+    for motion in (np.zeros(2), np.array([20.0, 0.0])):
+        noise = seen(0.9, lambda t, v=motion: t * v, np.random.default_rng(6), frames=5, objects=20)
+        assert noise.scale == pytest.approx(3.0, rel=0.2)
+
+
 def test_the_scale_stays_after_the_first_seconds():
     rng = np.random.default_rng(3)
     noise = seen(0.15, lambda t: np.zeros(2), rng, frames=120)
