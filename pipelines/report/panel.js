@@ -12,6 +12,9 @@ function describeTrack(panel, scene, result, k, id, colour) {
       const others = result.edges[k].filter(e => e[0] === id && e[3] === number).map(e => shortName(result.ids[e[1]]));
       if (others.length) facts.push([relation, others.join(", ")]);
     });
+    const modes = new Map();  // the rows of the last horizon come last
+    for (const mode of result.predictions[k] ?? []) if (mode[ID] === id && mode[FAN_MODE]) modes.set(mode[FAN_MODE], mode);
+    for (const [mode, at] of modes) facts.push([result.modes[mode], `${shareOf(at)}, in ${at[FAN_HORIZON] / 1000} s`]);
   } else facts.push(["now", "not there"]);
   facts.push(["from, to", `${scene.times[seen[0]].toFixed(1)} to ${scene.times[seen[seen.length - 1]].toFixed(1)} s`]);
   const title = document.createElement("h2"), list = document.createElement("dl");

@@ -206,6 +206,9 @@ def test_a_hidden_track_shows_where_each_of_its_modes_leads(tmp_path):
 """
     found = tried_in_browser(page, HELPERS + script, tmp_path)
     assert found["faults"] == []
+    panel = 'found.panel = $of("panel").textContent;'
+    followed = tried_in_browser(page, HELPERS + panel, tmp_path, "#t=3.0&id=ghost-6&method=whole")
+    assert "goes on30 %, in 2 swaits70 %, in 2 s" in followed["panel"]
     assert found["hidden"] == ""
     assert found["shown"] == ["track 6 waits: 70 %, in 2 s", "track 6 goes on: 30 %, in 2 s", ""]
     assert found["strength"][0] > 1.3 * found["strength"][1] > 0
