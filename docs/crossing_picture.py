@@ -2,6 +2,7 @@
 
 On the left arrows lead from vehicles that yield to those to which they do, with the probability that `saga` tells, at
 the last detection of the hidden one. Then a panel for each contender at the end of the gap, drawn as in `gap_picture`.
+Dashed are the 90 % ellipses of the modes that `saga` predicted for then, `AFTER` s after the last detection.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gap_picture import draw_surroundings, draw_tracks
+from gap_picture import draw_surroundings, draw_tracks, ellipse
 
 from benchmarks.gap_runs import GapBenchSettings, judged_run, judgement, prepared
 from benchmarks.recording_sets import recording_set
@@ -18,13 +19,16 @@ from benchmarks.variants import contenders
 from data_tools.figures import png
 from data_tools.files import write_bytes
 from pipelines.config import load_config
-from pipelines.learning.interactions import JudgedRun
+from pipelines.learning.interactions import JudgedRun, hidden
+from saga_fg import PredictedTracks, Tracker
 from saga_fg.learning.labelled_scene import Gap, LabelledScene
-from saga_fg.numerics import FloatArray
+from saga_fg.numerics import BoolArray, FloatArray
+from saga_fg.types import SHOWN_MODE
 
 SCENE, LENGTH = "priority_road-1000", 5.0  # s
 REACH = 26.0  # m from the middle of the crossing to the border of a panel
-YIELDS = "#b5179e"
+YIELDS, MODE = "#b5179e", "#2a7f3f"
+AFTER = 1.0  # s
 
 
 def write_crossing_picture(path: Path) -> None:
@@ -39,10 +43,17 @@ def write_crossing_picture(path: Path) -> None:
         told = drawn["saga"].holder(gap) in drawn["saga"].tracks[gap.start].relations.source
         return told * (judgement(drawn["kf"], gap).error - judgement(drawn["saga"], gap).error)
 
-    write_bytes(path, png(crossing_picture(labelled, max(gaps, key=gain), drawn)))
+    gap = max(gaps, key=gain)
+    ahead, time = saga.kept_alive().config.new_tracker(saga.method), labelled.scene.timestamps
+    assert isinstance(ahead, Tracker)
+    for frame in hidden(labelled, gaps):
+        if frame.timestamp <= time[gap.start] + AFTER:
+            ahead.step(frame)
+    told = ahead.predict([time[gap.stop - 1] - time[gap.start] - AFTER], hypotheses=True)
+    write_bytes(path, png(crossing_picture(labelled, gap, drawn, told)))
 
 
-def crossing_picture(labelled: LabelledScene, gap: Gap, drawn: dict[str, JudgedRun]) -> Any:
+def crossing_picture(labelled: LabelledScene, gap: Gap, drawn: dict[str, JudgedRun], told: PredictedTracks) -> Any:
     """A matplotlib `Figure`."""
     from matplotlib.figure import Figure
 
@@ -61,6 +72,7 @@ def crossing_picture(labelled: LabelledScene, gap: Gap, drawn: dict[str, JudgedR
         ax.set_title(f"{name}: mean error in the gap {error:.2f} m", loc="left", fontsize=10)
     for ax in (first, *others):
         ax.set(aspect="equal", xlim=(-REACH, REACH), ylim=(-REACH, REACH), xlabel="m")
+    _draw_modes(others[-1], told, told.id == drawn["saga"].holder(gap))
     handles, labels = others[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
@@ -76,6 +88,19 @@ def _draw_yields(ax: Any, run: JudgedRun, moment: int) -> None:
         if name == "yields to" and np.abs([begin, end]).max() < REACH:
             ax.annotate("", end, begin, arrowprops=style, zorder=7)
             ax.text(*(begin + 0.6 * (end - begin)), f"{probability:.2f}", zorder=8, **text)
+
+
+def _draw_modes(ax: Any, told: PredictedTracks, chosen: BoolArray) -> None:
+    """The 90 % ellipse of each mode of one track at the first horizon, and its name and probability."""
+    (row,) = chosen.nonzero()[0]
+    likely = [mode for mode in told.modes if mode.probability[0, row] >= SHOWN_MODE]
+    for number, mode in enumerate(likely):
+        share, place = mode.probability[0, row], mode.position[0, row]
+        ring = place + ellipse(mode.position_covariance[0, row])
+        ax.plot(*_as_it_is(ring), "--", color=MODE, linewidth=1.2, alpha=0.3 + 0.7 * share, zorder=6)
+        style = {"color": MODE, "linewidth": 0.6, "arrowstyle": "-"}
+        where = (-24.0, 20.0 - 5.0 * number)
+        ax.annotate(f"{mode.name} {share:.2f}", place, where, color=MODE, fontsize=9, arrowprops=style, zorder=8)
 
 
 def _as_it_is(points: FloatArray) -> FloatArray:

@@ -134,14 +134,14 @@ def draw_tracks(ax: Any, time: FloatArray, gap: Gap, shown: list[int], run: Judg
             places.append(run.tracks[k].boxes.position[row[0], :2])
             if gap.start < k < gap.stop and time[k] - time[gap.start] >= seconds - 1e-6:
                 seconds += 1.0
-                ring = places[-1] + _ellipse(run.tracks[k].position_covariance[row[0]])
+                ring = places[-1] + ellipse(run.tracks[k].position_covariance[row[0]])
                 ax.plot(*turned(ring), color=colour, linewidth=1.0, alpha=0.8, zorder=5)
         if places:
             label = f"track {name}, 90 % ellipses"
             ax.plot(*turned(np.array(places)), "-o", color=colour, markersize=3, linewidth=1.2, zorder=6, label=label)
 
 
-def _ellipse(covariance: FloatArray) -> FloatArray:
+def ellipse(covariance: FloatArray) -> FloatArray:
     """The ellipse (64, 2) of the probability `RING` of a position covariance (2, 2), about the origin."""
     values, vectors = np.linalg.eigh(covariance)
     angle = np.linspace(0.0, 2 * np.pi, 64)
