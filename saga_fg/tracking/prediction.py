@@ -114,7 +114,7 @@ def known_courses(state: TrackerState, dt: float, paths: Paths) -> tuple[tuple[K
             vehicles = rows[led]
             if not state.map_nodes.beliefs:  # else lights say who goes
                 ids = table.id[vehicles]
-                flow = state.right_of_way.accelerations(ids, place[vehicles], heading[led], speed[led], flow)
+                flow = state.right_of_way.accelerations(ids, place[vehicles], heading[led], velocity[vehicles], flow)
             pull[led] = flow
             after[vehicles] = wrap_angle(heading[led] + turn)
             rate[led] = turn / turning_time(motion, dt)

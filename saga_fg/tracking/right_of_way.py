@@ -125,14 +125,19 @@ class RightOfWay:
         return replace(self, line={}, halts={node: (1.0, at) for node, (_, at) in self._waiting.items() if waits})
 
     def accelerations(
-        self, ids: IntArray, position: FloatArray, heading: FloatArray, speed: FloatArray, free: FloatArray
+        self, ids: IntArray, position: FloatArray, heading: FloatArray, velocity: FloatArray, free: FloatArray
     ) -> FloatArray:
-        """Expected accelerations (k,) of vehicles along their paths, m/s^2; `free` (k,): of those that do not wait."""
+        """Expected accelerations (k,) of vehicles along their paths, m/s^2; `free` (k,): of those that do not wait.
+
+        Who waits brakes to a stop at the line; one whose velocity points back, as noise makes it, does not.
+        """
         rows = np.flatnonzero([node in self._waiting for node in ids.tolist()])
         known = [self._waiting[node] for node in ids[rows].tolist()]
         share, places = np.array([p for p, _ in known]), np.array([place for _, place in known]).reshape(-1, 2)
-        left, _ = ahead_and_aside(places - position[rows], unit(heading[rows]))
-        braking = np.where(left > -PASSED, speed[rows] ** 2 / (2 * np.maximum(left, AT_LINE)), 0.0)
+        ahead = unit(heading[rows])
+        speed = np.maximum(np.einsum("ni,ni->n", velocity[rows], ahead), 0.0)
+        left, _ = ahead_and_aside(places - position[rows], ahead)
+        braking = np.where(left > -PASSED, speed**2 / (2 * np.maximum(left, AT_LINE)), 0.0)
         found = free.copy()
         found[rows] = (1 - share) * free[rows] - share * np.minimum(braking, HARDEST)
         return found

@@ -150,8 +150,8 @@ def test_what_is_known_of_a_vehicle_is_forgotten_with_it():
 
 def braking_of(known, x, y, heading, speed, free=1.0, node=1):
     """The expected acceleration of one vehicle, that of those that go on being `free`."""
-    place = np.array([[x, y]], dtype=float)
-    return known.accelerations(np.array([node]), place, np.array([heading]), np.array([speed]), np.array([free]))[0]
+    place, velocity = np.array([[x, y]], dtype=float), speed * np.array([[np.cos(heading), np.sin(heading)]])
+    return known.accelerations(np.array([node]), place, np.array([heading]), velocity, np.array([free]))[0]
 
 
 def test_who_yields_brakes_to_its_line_and_others_go_on():
@@ -160,6 +160,7 @@ def test_who_yields_brakes_to_its_line_and_others_go_on():
     assert known.line[1, 2].tolist() == pytest.approx([0.0, -8.0])
     assert braking_of(known, 0, -18, NORTH, 5.0) == pytest.approx((1 - p) * 1.0 - p * 5.0**2 / 20)
     assert braking_of(known, 0, -8.1, NORTH, 0.0) == pytest.approx(1 - p), "it stands"
+    assert braking_of(known, 0, -8.1, NORTH, -0.5) == pytest.approx(1 - p), "it stands, its velocity is noise"
     assert braking_of(known, 0, -8.1, NORTH, 9.0, free=0.0) == pytest.approx(-4.0 * p), "no harder than drivers brake"
     assert braking_of(known, 0, -5, NORTH, 5.0) == pytest.approx(1 - p), "it is beyond the line"
     assert braking_of(known, -10, 0, EAST, 8.0, node=2) == pytest.approx(1.0, abs=0.4), "it has the right of way"
