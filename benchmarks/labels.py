@@ -14,8 +14,10 @@ Errors of labels against the truth, and an annotator who knows the truth and cor
 
 Labels are handed out where P(exists) >= `KEPT`. Their errors, track by track:
 
-    false    a track of which less than half of the boxes is within `GATE` of a true object of any class: once
-    class    a track more than half of whose boxes are at true objects of other classes: once
+    false    a track of which less than half of the boxes is within `GATE` of a true object of any class, of those at
+             moments when one that it comes near is annotated: once. An object seen before its annotation begins, far
+             away or beside the image, is none
+    class    a true track at least half of whose boxes that are at true objects are at those of other classes: once
     join     a change from one true object to another, between boxes that match
     off      a box of a true track that is off by `FAR_OFF` or `TURNED_OFF`, from the true one that it matches
     missed   a visible true box, detected within `GATE`, that no label matches
@@ -80,11 +82,17 @@ class JudgedLabels:
 
     def is_false(self, rows: IntArray) -> bool:
         """Whether these are the labels of no true object."""
-        return bool((self.any[rows] >= 0).mean() < 0.5)
+        near = self.any[rows] >= 0
+        annotated = self.truth.frame[np.isin(self.truth.id, self.truth.id[self.any[rows[near]]])]
+        return not near.any() or bool(near[np.isin(self.found.frame[rows], annotated)].mean() < 0.5)
+
+    def is_class(self, rows: IntArray) -> bool:
+        """Whether these are the labels of a true object of their class."""
+        return not self.is_false(rows) and bool((self.own[rows[self.any[rows] >= 0]] >= 0).mean() > 0.5)
 
     def is_other_class(self, rows: IntArray) -> bool:
         """Whether these are the labels of an object of another class."""
-        return not self.is_false(rows) and bool((self.own[rows] >= 0).mean() < 0.5)
+        return not self.is_false(rows) and not self.is_class(rows)
 
     def joins(self, rows: IntArray) -> list[tuple[int, int]]:
         """Pairs of successive rows between which a track changes from one true object to another."""
@@ -158,10 +166,10 @@ class Answers:
 
         for rows in scene.tracks().values():
             own = scene.own[rows] >= 0
-            answer("exists", p.exists, own.mean() > 0.5)
+            answer("exists", p.exists, not scene.is_false(rows))
             if not scene.is_false(rows):
-                answer("class", p.label, own.mean() > 0.5)
-            if own.mean() > 0.5:
+                answer("class", p.label, scene.is_class(rows))
+            if scene.is_class(rows):
                 answer("identity", p.one, not scene.joins(rows))
                 answer("heading", p.heading, 1 - scene.turned[rows][own].mean(), own.sum())
 
