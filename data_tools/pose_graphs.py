@@ -164,7 +164,8 @@ def _definite(edges: TextTable, matrix: FloatArray, project: bool) -> FloatArray
     smallest, largest, k = values[:, 0], values[:, -1], matrix.shape[1]
     expected = f"I11 ... I{k}{k}: expected a positive definite matrix, smallest eigenvalue"
     good = (project | (smallest >= -_SLIGHT * largest)) & (largest > 0)
-    edges.check(good, lambda row: f"{expected} {smallest[row]:.3g}; --project (Python: project) makes it one")
+    hint = "; --project (Python: project) makes it one"
+    edges.check(good, lambda row: f"{expected} {smallest[row]:.3g}{hint if largest[row] > 0 else ''}")
     near = np.flatnonzero(smallest <= 0)
     if len(near):
         example = edges.fault(int(near[0]), f"smallest eigenvalue {smallest[near[0]]:.3g}")

@@ -284,10 +284,10 @@ function player({scenes, start, thresholds, ghosts, beside, review}) {
     canvas.setPointerCapture(e.pointerId);
   };
   canvas.onpointermove = e => {
-    pointer = under(e)[1];
-    canvas.title = modeAt(...under(e));
-    if (!held) return;
-    if (edited) { editor.drag(under(e)[1]); return; }
+    const [view, at] = under(e);
+    pointer = at;
+    if (!held) { canvas.title = modeAt(view, at); return; }
+    if (edited) { editor.drag(at); return; }
     const dx = e.clientX - held[0], dy = e.clientY - held[1];
     moved += Math.abs(dx) + Math.abs(dy);
     offset = [offset[0] + dx, offset[1] + dy]; held = [e.clientX, e.clientY];

@@ -121,6 +121,7 @@ class LidarOdometry:
         self._velocity_known = False  # by a scan that showed the whole motion, or by other sensors
         self._confirmed: float | None = None  # s, when a scan showed the whole motion, or a speed was taken after one
         self._misfits = 0  # scans in a row that did not fit
+        self._elsewhere = False  # they were said to be of another place
         self._places: list[FloatArray] = []  # (3,) of scans in the map, m
         self._open: tuple[float, float] | None = None  # since when motions are open, s, and deviation of the speed
         self._registered: OdometryStep | None = None  # the last one that was registered, or the first
@@ -279,17 +280,18 @@ class LidarOdometry:
         before = last if self._misfits > 1 else self._registered or last
         since_then = inverse_transform(before.map_T_lidar) @ found.map_T_scan
         self._velocity = constant_velocity(since_then, timestamp - before.timestamp)
-        if self._misfits == _ELSEWHERE:
+        lost_before, self._elsewhere = self._elsewhere, self._misfits >= _ELSEWHERE
+        if self._elsewhere and not lost_before:
             _LOG.warning(
                 "scan at %.3f s: it fits the map nowhere, as the scans before it: lost, its place is unknown", timestamp
             )
+            lost = _ANYWHERE
         if 0 < self._misfits < _BEGIN_ANEW:
-            lost = _ANYWHERE if self._misfits == _ELSEWHERE else lost
             return OdometryStep(timestamp, found.map_T_scan, lost, scan, False, None)
         keyframe = moved_on(inverse_transform(self._keyframe) @ found.map_T_scan)
         names = found.observed.names(self._velocity[3:] if np.linalg.norm(self._velocity[3:]) > _STANDING else None)
         covariance = found.covariance + self._of_open_motions(found.observed, last.timestamp, timestamp)
-        if self._misfits == _BEGIN_ANEW:
+        if self._misfits >= _BEGIN_ANEW:
             covariance = covariance + _ANYWHERE
         self._velocity_known |= not names
         if not names:

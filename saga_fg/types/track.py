@@ -310,8 +310,11 @@ class PredictedMode:
 LEAST_MODE = 1e-3
 """Probability below which a mode is left out of tables."""
 
-HIDDEN, SHOWN_MODE = 0.3, 0.05
-"""Seconds without detection from which an object is hidden, and the least probability of its modes that are shown."""
+HIDDEN = 0.3
+"""Seconds without detection from which an object is hidden."""
+
+SHOWN_MODE = 0.05
+"""Least probability of a mode of a hidden object that is shown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,7 +329,7 @@ class PredictedTracks(ShownTable):
     yaw                  (H, N)        heading, rad; NaN where it is unknown
     position_covariance  (H, N, 2, 2)  m^2
     velocity_covariance  (H, N, 2, 2)  (m/s)^2
-    coasting             (N,)          s since the last detection
+    coasting             (N,)          s since the last detection, at `timestamp`
     modes                              moving and stationary, of which mean and covariance are the mixture's; if
                                        hypotheses were asked for, waits, follows and goes on stand for moving, beside
                                        the same mean and covariance

@@ -75,7 +75,7 @@ def test_carried_further_than_nearby(known: bool, caplog: pytest.LogCaptureFixtu
     worlds = street(0), street(0 if known else 3)
     for k in range(42):
         row = k if k < 36 else k - 26
-        scan = simulate_scan(worlds[k >= 36], poses[row], rng, SMALL)
+        scan = NOTHING if k == 38 else simulate_scan(worlds[k >= 36], poses[row], rng, SMALL)
         step = odometry.step(scan, 0.1 * k + 2.0 * (k >= 36))
         variance += step.covariance[3, 3]
     assert ("lost, its place is unknown" in caplog.text) != known
@@ -84,7 +84,6 @@ def test_carried_further_than_nearby(known: bool, caplog: pytest.LogCaptureFixtu
         off = inverse_transform(poses[0]) @ poses[row]
         np.testing.assert_allclose(step.map_T_lidar[:3, 3], off[:3, 3], atol=0.2)
     else:
-        assert "lost, its place is unknown" in caplog.text
         assert not step.keyframe
         assert variance > 20.0**2
 

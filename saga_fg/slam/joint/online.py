@@ -5,14 +5,14 @@ stationary with `LIKELY` and more (`saga_fg.slam.joint.record`), whose detection
 covariance: a detector errs alike from frame to frame. Moving objects are not in it, nor are frames within
 `KEYFRAME_PERIOD` of a keyframe: they are tracked alone. The first pose of the lag is held, its errors have the estimate
 that they had when they were newest, after their random walk since the keyframe before, or none if that estimate was
-rejected. The path goes on by increments
-without the errors, so that it does not jump and tracks along it keep their velocities.
+rejected. The path goes on by increments without the errors, so that it does not jump and tracks along it keep their
+velocities.
 
 The estimate steps aside where it contradicts the odometry. With errors e ~ N(0, P0) by the device's noise, estimated
 as m with the covariance P, m is N(0, P0 - P): where the sum of m_i^2 / (P0 - P)_ii exceeds `LIMIT`, 99 % of chi^2 with
 three degrees of freedom, what seems to stand does not, or the detector is wrong, and the path goes on by the odometry
-as it is. P0 grows with the random walk since the start. It does so, too, where the graph of a frame did not converge.
-Where few objects stand, m is small and so is what it changes.
+as it is. P0 grows with the random walk since the start. The path goes on by odometry, too, where the graph of a frame
+did not converge. Where few objects stand, m is small and so is what it changes.
 """
 
 import logging
@@ -27,6 +27,7 @@ from factors import ERROR_DIM, ResidualFactors, SolverSettings, relative_factors
 from saga_fg.numerics import (
     FloatArray,
     carried_covariance,
+    checked,
     checked_covariances,
     checked_transform,
     inverse_transform,
@@ -83,6 +84,7 @@ class _Motion:
     mended: FloatArray
 
     def followed_by(self, a_T_b: FloatArray, covariance: FloatArray | None, mended: FloatArray) -> Self:
+        """With the motion of the next frame behind it."""
         if self.covariance is not None and covariance is not None:
             covariance = carried_covariance(inverse_transform(a_T_b), self.covariance) + covariance
         else:
@@ -122,7 +124,8 @@ class OnlinePath:
         """
         a_T_b = checked_transform("a_T_b", a_T_b)
         if covariance is not None:
-            covariance = checked_covariances("covariance", np.asarray(covariance)[None], 1, 6)[0]
+            stated = checked("covariance", covariance, (6, 6))
+            covariance = checked_covariances("covariance", stated[None], 1, 6)[0]
         number, pose, motion = 0, self.world_T_ego, self._motion
         if self._window:
             number = self._window[-1].record.epoch + 1
