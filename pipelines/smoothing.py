@@ -138,7 +138,7 @@ class SmoothedScene:
     counts   where its boxes come from
     frames   frames taken in
     seconds  time spent
-    noise    that was found of sensors, in units of what their models say
+    noise    scale of each sensor's noise, by name, estimated from its detections; 1 is its noise model
     outcomes what became of the corrections that may be about it
     """
 

@@ -382,10 +382,7 @@ def g2o(
             "the rest (consensus), or a loss over all of them.",
         ),
     ] = None,
-    project: Annotated[
-        bool,
-        typer.Option("--project", help="Make information matrices positive definite that are not, and say how many."),
-    ] = False,
+    project: Annotated[bool, typer.Option("--project", help="Project indefinite information, and count it.")] = False,
     verbose: Verbose = False,
 ) -> None:
     """Optimise a pose graph, whatever the guess in the file is worth.

@@ -121,7 +121,7 @@ class LidarOdometry:
         self._velocity_known = False  # by a scan that showed the whole motion, or by other sensors
         self._confirmed: float | None = None  # s, when a scan showed the whole motion, or a speed was taken after one
         self._misfits = 0  # scans in a row that did not fit
-        self._elsewhere = False  # they were said to be of another place
+        self._elsewhere = False  # the sensor is lost, which was reported
         self._places: list[FloatArray] = []  # (3,) of scans in the map, m
         self._open: tuple[float, float] | None = None  # since when motions are open, s, and deviation of the speed
         self._registered: OdometryStep | None = None  # the last one that was registered, or the first
@@ -362,7 +362,8 @@ class LidarOdometry:
         return None
 
     def _apart(self, places: FloatArray) -> FloatArray:
-        """Those of some places (n, 3) that are in the map, from the last to the first, as far apart as is searched."""
+        """Centres (k, 3) of searches, m: the origin, then those of `places` (n, 3) in range, newest first, a search
+        window apart."""
         found = [np.zeros(3)]
         for place in places[::-1][np.linalg.norm(places[::-1], axis=1) < self.settings.max_range]:
             if np.linalg.norm(np.array(found) - place, axis=1).min() >= 2 * _SHIFTS[-1]:

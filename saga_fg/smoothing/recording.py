@@ -249,7 +249,7 @@ class LabelBuilder:
 
     @property
     def noise(self) -> dict[str, float]:
-        """What was found of the sensors' noise, in units of what their models say, by name."""
+        """Scale of each sensor's noise, by name, estimated from its detections; 1 is its noise model."""
         return {name: one.scale for name, one in self._tracker.sensor_noise.items()}
 
     @property
